@@ -4,20 +4,32 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.swarm.devices.amplifiers import SwarmAmplifiers
+from benchmarks.swarm.devices.hexapod import SwarmHexapod
 from benchmarks.swarm.lines import Line
 from fitctl.clock import Clock
 from fitctl.config import Rig
-from fitctl.drivers.interface import AzEl
+from fitctl.config.base import ARCSEC_PER_RAD
+from fitctl.drivers.interface import AzEl, Pose
 from fitctl.logging.records import AnyRecord, DevicesOpened, Event, ModeChange, PiezoReading, Tick
-from fitctl.messages.commands import AnyCommand, Look, Recover, Reply, Standby, Stop
+from fitctl.messages.commands import (
+    AnyCommand,
+    Jog,
+    Look,
+    MoveCollector,
+    Recover,
+    Reply,
+    Standby,
+    Stop,
+)
 from fitctl.messages.modes import FOLLOWING, Mode, Trigger
+from fitctl.model.optics import motor_sky_rad_per_rad
 from fitctl.model.plant import Plant
 from fitctl.service.admission import Sender
 from fitctl.supervisor.supervisor import Supervisor
@@ -43,6 +55,14 @@ _MOST_UNREAD_S = 14.0  # interlock piezo_limit does not wait longer
 _CHECKED_S = 0.5  # so often the swarm checks which star a loop follows
 _ANOTHERS_PX = 6.0  # from its own star, no window of a loop shows its own
 _MOST_WRONG_S = 10.0
+_SAFE_S, _SAFE_BY_PIEZO_S = (
+    3.0,
+    8.0,
+)  # as `made_safe` in the fault catalogue, tests/faults/devices.py
+_RESTS_S = 1.0  # beyond the time after which a drive without its master stops by itself
+_HARDLY = 0.02  # of the velocity limit: slower, a servo corrects what its encoder counts
+_MOVED_S = 1.0  # beyond the time that a siderostat takes from one end of its travel to the other
+_COLLECTOR_RESTS_S = 3.0
 
 
 class Violation(NamedTuple):
@@ -51,6 +71,30 @@ class Violation(NamedTuple):
     invariant: str
     at_s: float
     detail: str
+
+
+class _Lasting:
+    """For how long something has been so without a pause, by name; the machine's stalls do not count."""
+
+    def __init__(self) -> None:
+        self._since_s: dict[str, float] = {}
+
+    def lasted_s(self, name: str, *, is_so: bool, now_s: float, from_s: float = -math.inf) -> float:
+        """For how long it has been so, as far as that was after `from_s`; 0 if it is not so now."""
+        if not is_so:
+            self._since_s.pop(name, None)
+            return 0.0
+        since_s = self._since_s[name] = max(from_s, self._since_s.get(name, now_s))
+        return now_s - since_s
+
+    def leave_out(self, left_out_s: float) -> None:
+        """Do not count a time."""
+        for name in self._since_s:
+            self._since_s[name] += left_out_s
+
+    def clear(self) -> None:
+        """Begin anew."""
+        self._since_s.clear()
 
 
 class Invariants:
@@ -77,6 +121,7 @@ class Invariants:
         plant: Plant,
     ) -> None:
         self.violations: list[Violation] = []
+        self.hexapod: SwarmHexapod | None = None
         self._rig = rig
         self._clock = clock
         self._amplifiers = amplifiers
@@ -91,6 +136,17 @@ class Invariants:
         self._three_periods_s = {
             name: 3 / loop.siderostat.servo.rate_hz for name, loop in rig.loops.items()
         }
+        self._travel_rad, self._coasts_rad, self._moved_s = {}, {}, {}
+        for name, loop in rig.loops.items():
+            siderostat = loop.siderostat
+            sky_arcsec_per_rad = motor_sky_rad_per_rad(siderostat) * ARCSEC_PER_RAD
+            self._travel_rad[name] = siderostat.travel_sky_arcsec / sky_arcsec_per_rad
+            # A servo acts on readings of up to this age, and its command takes up to three periods to arrive.
+            unseen_s = self._three_periods_s[name] + 1 / siderostat.servo.gain_per_s
+            self._coasts_rad[name] = siderostat.velocity_limit_rad_s * unseen_s
+            crossing_s = 2 * self._travel_rad[name] / siderostat.velocity_limit_rad_s
+            self._moved_s[name] = crossing_s + _MOVED_S
+        self._needed = {name: list(self._needed_devices(name)) for name in rig.loops}
         camera = rig.camera
         self._oldest_s = camera.frame_delay_s + _MOST_PERIODS * camera.period_s
         self._most_step_s = _MOST_STEP_S * (1 + len(self._stellar_loops))
@@ -100,6 +156,10 @@ class Invariants:
         self._unneeded_since_s: dict[str, float] = {}
         self._busy_since_s = math.inf
         self._stepped_s = 0.0
+        self._silent, self._turning, self._stopped_for = _Lasting(), _Lasting(), _Lasting()
+        self._ticked_s = self._stall_ended_s = 0.0
+        self._jogged_s: dict[str, float] = {}
+        self._collector_is_stopped = False
         self.nothing_fails = False
         self._stopped_s: dict[str, float] = {}  # by loop: a stop that no power-up has followed
         self._power_up_s: dict[str, float] = {}
@@ -114,6 +174,21 @@ class Invariants:
         self._checked_s: dict[str, float] = {}  # by loop: when the swarm last checked its star
         self._wrong_since_s: dict[str, float] = {}  # by loop: since when it follows another star
         self._pointed_at: set[str] = set()  # a person said which star these loops follow
+
+    def _needed_devices(self, name: str) -> Iterator[tuple[str, float]]:
+        """The devices whose silence makes a loop go to SAFE in any other mode but OFF, and within what time.
+
+        A siderostat ends its servo, a D/A or a camera fails in the tick that uses it, interlock frame_missing
+        is for a camera that sends nothing, and interlock diode_samples for photodiodes. A piezo amplifier has
+        longer: it is read once a second, and has failed at the second bad answer.
+        """
+        yield f"{name} siderostat", _SAFE_S
+        if name in self._rig.metrology_loops:
+            yield f"{name} photodiodes", _SAFE_S
+        else:
+            yield "camera", _SAFE_S
+            yield f"{name} D/A", _SAFE_S
+            yield f"{name} piezo", _SAFE_BY_PIEZO_S
 
     def watch(self, supervisor: Supervisor | None) -> None:
         """Watch this one from now on; without one, what needs none."""
@@ -136,6 +211,10 @@ class Invariants:
         self._unneeded_since_s.clear()
         self._wrong_since_s.clear()
         self._pointed_at.clear()
+        for lasting in (self._silent, self._turning, self._stopped_for):
+            lasting.clear()
+        self._jogged_s.clear()
+        self._collector_is_stopped = False
         self._busy_since_s = math.inf
         # A machine that stands still does so for the next supervisor too.
         self._stepped_s = max(self._stepped_s, self._clock.now_s())
@@ -149,11 +228,15 @@ class Invariants:
     def stalled(self, until_s: float, added_s: float) -> None:
         """The machine stands still, `added_s` longer than was known, and nothing can be expected of it."""
         self._stepped_s = max(self._stepped_s, until_s)
+        self._stall_ended_s = until_s
+        self._ticked_s += added_s  # so that a stall is not left out twice
         for name in self._stopped_s:
             self._stopped_s[name] = max(self._stopped_s[name], self._stepped_s)
         for since_s in (self._powerless_since_s, self._unneeded_since_s):
             for name in since_s:
                 since_s[name] += added_s
+        for lasting in (self._silent, self._turning, self._stopped_for):
+            lasting.leave_out(added_s)
 
     def zero_lost(self, name: str) -> None:
         """A loop's encoders begin anew at zero."""
@@ -196,15 +279,24 @@ class Invariants:
         if isinstance(command, Stop):
             for name in self._named(command):
                 self._stopped_s[name] = self._clock.now_s()
+        elif isinstance(command, Jog):
+            self._jogged_s |= dict.fromkeys(self._named(command), self._clock.now_s())
 
     def answered(self, command: AnyCommand, reply: Reply) -> None:
         """A command was obeyed or refused."""
         if not reply.accepted:
             return
         now_s = self._clock.now_s()
+        if isinstance(command, Stop | MoveCollector):  # a stop of whichever loop
+            stops = isinstance(command, Stop) or command.action == "stop"
+            if not (stops and self._collector_is_stopped):
+                self._stopped_for.clear()
+            self._collector_is_stopped = stops
         for name in self._named(command):
             if isinstance(command, Stop):
                 self._stop_answered_s[name] = now_s
+            elif isinstance(command, Jog):
+                self._jogged_s[name] = now_s
             elif isinstance(command, Standby | Recover):
                 self._power_up_s[name] = now_s
             elif isinstance(command, Look):
@@ -320,6 +412,8 @@ class Invariants:
             self.violated(
                 "no stage moves by a zero that is lost", f"{name}: {velocity_rad_s} rad/s"
             )
+        else:
+            self._within_travel(name, velocity_rad_s)
         loop, three_periods_s = supervisor.loops[name], self._three_periods_s[name]
         since_stop_s = self._clock.now_s() - self._stopped_s.get(name, math.inf)
         if since_stop_s > three_periods_s:
@@ -334,6 +428,49 @@ class Invariants:
                     "no stage moves in OFF or SAFE",
                     f"{name}: {velocity_rad_s} rad/s after {at_rest_s:.3f} s in {loop.mode.name}",
                 )
+
+        elif loop.mode is Mode.STANDBY and fastest_rad_s > _HARDLY * self._most_rad_s[name]:
+            self._stands_by(name, loop.mode_since_s, velocity_rad_s)
+
+    def _within_travel(self, name: str, velocity_rad_s: AzEl) -> None:
+        """No motor that is beyond the travel, by the drive's count, is driven farther out."""
+        most_rad = self._travel_rad[name] + self._coasts_rad[name]
+        hardly_rad_s = _HARDLY * self._most_rad_s[name]
+        motors_rad = self._plant.loops[name].state.motor_rad[0].tolist()
+        zeros_rad = self._amplifiers[name].zero_rad
+        for motor_rad, zero_rad, rad_s in zip(motors_rad, zeros_rad, velocity_rad_s, strict=True):
+            position_rad = motor_rad - zero_rad
+            if (
+                abs(position_rad) > most_rad
+                and math.copysign(rad_s, position_rad * rad_s) > hardly_rad_s
+            ):
+                self.violated(
+                    "no siderostat is driven beyond its travel",
+                    f"{name}: {rad_s:.2f} rad/s at {position_rad:.2f} rad, at most {most_rad:.2f} rad",
+                )
+
+    def _stands_by(self, name: str, since_s: float, velocity_rad_s: AzEl) -> None:
+        """In STANDBY a siderostat moves only where a jog has sent it, or back to where it was held."""
+        line = self._lines[f"{name} siderostat"]
+        moves_s = max(since_s, self._jogged_s.get(name, 0.0), line.healed_s, self._stall_ended_s)
+        rested_s = self._clock.now_s() - moves_s
+        if not line.faults and rested_s > self._moved_s[name]:
+            self.violated(
+                "a siderostat that nobody moves stands still in STANDBY",
+                f"{name}: {velocity_rad_s} rad/s {rested_s:.3f} s after it was moved",
+            )
+
+    def pose(self, pose: Pose, velocity_mm_s: float) -> None:
+        """A pose is sent to the hexapod, and how fast it is to go there."""
+        collector = self._rig.collector
+        if collector is None:
+            return
+        hexapod = collector.hexapod
+        if not velocity_mm_s <= hexapod.velocity_limit_mm_s * _SLACK:
+            self.violated("the hexapod's velocity within its limit", f"{velocity_mm_s} mm/s")
+        for axis, value, (low, high) in zip(Pose._fields, pose, hexapod.travel.ends, strict=True):
+            if not low <= value <= high:
+                self.violated("the hexapod's poses within its travel", f"{axis} {value}")
 
     def powered_unread(self, name: str) -> None:
         """Motors are given power, and nobody has read where they are."""
@@ -369,6 +506,7 @@ class Invariants:
         if supervisor is None:
             return
         now_s = self._clock.now_s()
+        since_tick_s, self._ticked_s = now_s - self._ticked_s, now_s
         took_s, self._stepped_s = now_s - self._stepped_s, now_s
         if took_s > self._most_step_s:
             self.violated("a step ends", f"one took {took_s:.2f} s")
@@ -381,8 +519,62 @@ class Invariants:
                 self._piezo_read_s[name] = now_s
             elif now_s - self._piezo_read_s[name] > _MOST_UNREAD_S and piezo.error == "":
                 self.violated("an open piezo amplifier is read", f"{name}: not for a long time")
+        if jobs.busy:
+            self._silent.leave_out(since_tick_s)
         for name, loop in supervisor.loops.items():
             self._power(name, loop.mode, busy=jobs.busy, now_s=now_s)
+            self._safe_in_time(name, loop.mode, now_s)
+            self._turns(name, loop.mode, now_s)
+        self._collector_rests(now_s)
+
+    def _safe_in_time(self, name: str, mode: Mode, now_s: float) -> None:
+        """A loop with a device that has been silent for long is in SAFE or OFF."""
+        for device, most_s in self._needed[name]:
+            line = self._lines[device]
+            silent_s = self._silent.lasted_s(
+                f"{name}: {device}",
+                is_so=mode not in _AT_REST and line.is_silent,
+                now_s=now_s,
+                from_s=line.answered_s,
+            )
+            if silent_s > most_s:
+                how = ", ".join(sorted(line.faults)) or "not connected"
+                self.violated(
+                    "a loop without one of its devices is SAFE in time",
+                    f"{name}: in {mode.name} after {device} was silent for {silent_s:.2f} s ({how})",
+                )
+
+    def _turns(self, name: str, mode: Mode, now_s: float) -> None:
+        """Motors stand still in OFF and SAFE, unless their drive watches nobody and cannot be reached."""
+        amplifiers = self._amplifiers[name]
+        line = amplifiers.line
+        turns = mode in _AT_REST and amplifiers.velocity_rad_s != (0.0, 0.0)
+        if turns and amplifiers.watches_nobody:
+            turns = name in self._opened and line.connected and not line.faults
+        turned_s = self._turning.lasted_s(name, is_so=turns, now_s=now_s)
+        if turned_s > amplifiers.master_timeout_s + _RESTS_S:
+            self.violated(
+                "motors stand still in OFF and SAFE",
+                f"{name}: {amplifiers.velocity_rad_s} rad/s for {turned_s:.2f} s in {mode.name}",
+            )
+
+    def _collector_rests(self, now_s: float) -> None:
+        """A stop of any loop, or of the collector, brings the platform to rest."""
+        hexapod = self.hexapod
+        if hexapod is None:
+            return
+        line = hexapod.line
+        stopped_s = self._stopped_for.lasted_s(
+            "",
+            is_so=self._collector_is_stopped and line.connected and not line.faults,
+            now_s=now_s,
+            from_s=line.healed_s,
+        )
+        # A course is many short moves: between two of them the platform is at rest.
+        if stopped_s > _COLLECTOR_RESTS_S and hexapod.moves:
+            self.violated(
+                "a stop stops the collector", f"it moves {stopped_s:.2f} s after the stop"
+            )
 
     def _power(self, name: str, mode: Mode, *, busy: bool, now_s: float) -> None:
         """Whether the amplifiers have power where they need it, and none where nobody does.

@@ -23,6 +23,8 @@ _SLICE_S = 0.0005
 FAULTS = ("slow", "deaf", "mute", "refuses", "garbled", "unplugged")
 """Faults of a line, in this order: late answers, lost requests, lost answers, a device that refuses,
 answers that make no sense, and a cable that is unplugged."""
+SILENCE = frozenset(FAULTS) - {"slow"}
+"""Faults during which no answer arrives that makes sense."""
 
 
 class Bus:
@@ -66,6 +68,8 @@ class Line:
         The faults in force, from `FAULTS`. The value of "slow" is the factor.
     healed_s : float
         When the last fault ended.
+    answered_s : float
+        When the last of those faults ended during which no answer arrives.
     connected : bool
         Whether the driver has opened the line, and it has not broken since.
     bus : Bus or None
@@ -84,7 +88,7 @@ class Line:
         self.device = device
         self.endpoint = endpoint
         self.faults: dict[str, float] = {}
-        self.healed_s = -math.inf
+        self.healed_s = self.answered_s = -math.inf
         self.connected = False
         self.bus: Bus | None = None
         self.timeout_s = timeout_s
@@ -97,6 +101,13 @@ class Line:
         for fault in faults or list(self.faults):
             self.faults.pop(fault, None)
         self.healed_s = self._time.now_s()
+        if not self.faults.keys() & SILENCE:
+            self.answered_s = self.healed_s
+
+    @property
+    def is_silent(self) -> bool:
+        """No answer arrives, or none that makes sense."""
+        return not self.connected or bool(self.faults and self.faults.keys() & SILENCE)
 
     def open(self) -> None:
         """Connect.

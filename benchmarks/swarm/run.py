@@ -79,6 +79,9 @@ NO_EXCEPTION = "no exception escapes"
 HEAL_S = 60.0  # within which a loop must hold its star again
 _HISTORY_S = 20.0  # a frame may come so late, after several stalls in a row
 _ANSWER_S = 5.0
+_ANSWERED_AT_THE_END_S = (
+    1.5  # when the service has ended: younger commands and answers may be under way
+)
 _WIND_DOWN_S = 1.0  # as fitctl.daemon.run
 _START_S = 2.0
 _LAST_RECORDS_S = 5.0
@@ -186,7 +189,9 @@ class Instrument:
         loops = {name: self._loop_devices(name) for name in rig.loops}
         hexapod = None
         if rig.collector is not None:
-            hexapod = SwarmHexapod(self.plant, time, rig, self._random("hexapod"))
+            hexapod = self.invariants.hexapod = SwarmHexapod(
+                self.plant, time, rig, self._random("hexapod"), self.invariants.pose
+            )
             self._add("hexapod", hexapod)
         self.devices = Devices(self.camera, loops, hexapod)
         self.start()
@@ -303,6 +308,7 @@ class Instrument:
         if self.service is not None:
             self.service.stop()
         self.service = None
+        self.answers_due(_ANSWERED_AT_THE_END_S)
         self._finish_log()
         self.time.kill_process()
         self._places = []
@@ -403,11 +409,11 @@ class Instrument:
             loop=name, expected_az_sky_arcsec=az_arcsec, expected_el_sky_arcsec=el_arcsec
         )
 
-    def answers_due(self) -> None:
+    def answers_due(self, within_s: float = _ANSWER_S) -> None:
         """No command waits longer for its answer than a step may take; a stalled machine does not count."""
         now_s = self.time.awake_s()
         for since_s, awake_s, name in self._unanswered.values():
-            if now_s - awake_s > _ANSWER_S:
+            if now_s - awake_s > within_s:
                 self.invariants.violated(
                     "a command is answered once", f"{name} of {since_s:.3f} s never was"
                 )

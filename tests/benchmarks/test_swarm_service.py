@@ -7,7 +7,7 @@ from benchmarks.swarm import service as swarm_service
 from benchmarks.swarm.plan import Kill, Order, Plan
 from benchmarks.swarm.run import run_plan
 from fitctl.logging.records import Event
-from fitctl.messages.commands import Standby, Stop, TakeOver
+from fitctl.messages.commands import Shutdown, Standby, Stop, TakeOver
 from fitctl.service import intake
 from fitctl.service.admission import Admission
 from fitctl.service.envelope import decode_envelope
@@ -115,3 +115,22 @@ def test_garbage_that_is_taken_for_a_command_is_found(monkeypatch):
     monkeypatch.setattr(intake, "decode_command", obliging)
 
     assert "what is no command is refused" in violated()
+
+
+@pytest.mark.long
+def test_a_command_that_is_not_answered_before_a_shutdown_is_found(monkeypatch):
+    answer = Service._answer
+
+    def silent(self, waiting, reply):
+        if not isinstance(self._sent[waiting.tag][1], Standby):
+            answer(self, waiting, reply)
+
+    happenings = [
+        Order(at_s=0.1, who="ada", command=Standby()),
+        Order(at_s=2.0, who="ada", command=Shutdown()),
+    ]
+    short = msgspec.structs.replace(PLAN, duration_s=4.5, happenings=happenings)
+    assert run_plan(short).violations == []
+    monkeypatch.setattr(Service, "_answer", silent)
+
+    assert "Standby of 0.100 s never was" in {one.detail for one in run_plan(short).violations}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from random import Random
 
@@ -28,12 +29,20 @@ _REFERENCE_S = 5.0
 class SwarmHexapod(SimulatedHexapod):
     """The hexapod's controller on a serial line."""
 
-    def __init__(self, plant: Plant, time: VirtualTime, rig: Rig, random: Random) -> None:
+    def __init__(
+        self,
+        plant: Plant,
+        time: VirtualTime,
+        rig: Rig,
+        random: Random,
+        sent: Callable[[Pose, float], None] = lambda _pose, _velocity_mm_s: None,
+    ) -> None:
         _, mocks = rig.mock_parts()
         device = rig.collector.hexapod  # type: ignore[union-attr]
         super().__init__(plant.collector, time, device, mocks.hexapod)  # type: ignore[arg-type]
         self.line = Line("hexapod", device.endpoint, time, random, 0.01, device.response_timeout_s)
         self._time = time
+        self._sent = sent
 
     def open(self) -> DeviceIdentity:
         """Connect and check."""
@@ -53,6 +62,7 @@ class SwarmHexapod(SimulatedHexapod):
 
     def move_to(self, pose: Pose, velocity_mm_s: float) -> None:
         """Start a move."""
+        self._sent(pose, velocity_mm_s)
         self.line.ask(partial(super().move_to, pose, velocity_mm_s))
 
     def pose(self) -> HexapodReading:

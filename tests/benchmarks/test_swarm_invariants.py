@@ -1,0 +1,296 @@
+"""What the swarm requires of devices that are silent, and of stages that are to stand still."""
+
+from random import Random
+from types import SimpleNamespace
+
+import pytest
+
+from benchmarks.swarm.devices.hexapod import SwarmHexapod
+from benchmarks.swarm.invariants import Invariants
+from benchmarks.swarm.lines import FAULTS, Line
+from benchmarks.swarm.plan import Order, Plan, Strike, devices_of
+from benchmarks.swarm.run import RIGS as FOLDER
+from benchmarks.swarm.run import run_plan
+from benchmarks.swarm.threads import VirtualTime
+from fitctl.config import load_rig
+from fitctl.drivers.interface import Pose
+from fitctl.messages.commands import Jog, MoveCollector, Release, Reply, Standby, Stop
+from fitctl.messages.modes import Mode
+from fitctl.model.plant import Plant
+from fitctl.stages.collector import CollectorDrive
+from fitctl.supervisor.piezo import PiezoWatch
+
+TESTBED = "fit-testbed.toml"
+TICK_S = 0.1
+
+
+class Rig:
+    """Invariants over stand-ins of a supervisor, of amplifiers and of lines that are all connected."""
+
+    def __init__(self, rig="fit-mock.toml", mode=Mode.VERNIER):
+        self.rig = load_rig(FOLDER / rig)
+        self.time = VirtualTime()
+        self.lines = {
+            name: Line(name, "", self.time, Random(1), 0.001, 0.1) for name in devices_of(rig)
+        }
+        for line in self.lines.values():
+            line.connected = True
+        self.amplifiers = {
+            name: SimpleNamespace(
+                zero_rad=(0.0, 0.0),
+                powered=mode not in {Mode.OFF, Mode.SAFE},
+                watches_nobody=False,
+                velocity_rad_s=(0.0, 0.0),
+                master_timeout_s=0.5,
+                line=self.lines[f"{name} siderostat"],
+            )
+            for name in self.rig.loops
+        }
+        self.plant = Plant(self.rig, [1], history_s=20.0)
+        self.jobs = SimpleNamespace(busy=False)
+        self.loops = {name: SimpleNamespace(mode=mode, mode_since_s=0.0) for name in self.rig.loops}
+        self.invariants = Invariants(self.rig, self.time, self.amplifiers, self.lines, self.plant)
+        supervisor = SimpleNamespace(loops=self.loops, _device_jobs=self.jobs, piezos={})
+        self.invariants.watch(supervisor)
+
+    def go_on(self, seconds):
+        """Tick for a while; return what was violated until now."""
+        for _ in range(round(seconds / TICK_S)):
+            self.time.run_until(self.time.now_s() + TICK_S)
+            self.invariants.tick()
+        return [one.invariant for one in self.invariants.violations]
+
+
+SAFE = ["a loop without one of its devices is SAFE in time"]
+SILENT = [
+    ("fit-mock.toml", "right siderostat", 3.0),
+    ("fit-mock.toml", "right D/A", 3.0),
+    ("fit-mock.toml", "right piezo", 8.0),
+    ("fit-mock.toml", "camera", 3.0),
+    (TESTBED, "metrology photodiodes", 3.0),
+]
+
+
+@pytest.mark.parametrize(("rig", "device", "within_s"), SILENT)
+def test_a_loop_whose_device_is_silent_must_be_safe_in_time(rig, device, within_s):
+    watched = Rig(rig)
+    watched.lines[device].faults["mute"] = 0.0
+
+    assert watched.go_on(within_s) == []
+    assert watched.go_on(0.3) == SAFE
+
+
+@pytest.mark.parametrize("fault", [fault for fault in FAULTS if fault != "slow"])
+def test_each_fault_of_a_line_that_leaves_no_answer_counts(fault):
+    watched = Rig()
+    watched.lines["right D/A"].faults[fault] = 0.0
+
+    assert watched.go_on(4.0) == SAFE
+
+
+def test_a_line_that_is_not_connected_is_silent():
+    watched = Rig()
+    watched.lines["right siderostat"].connected = False
+
+    assert watched.go_on(4.0) == SAFE
+
+
+@pytest.mark.parametrize("mode", [Mode.OFF, Mode.SAFE])
+def test_a_loop_that_is_safe_needs_no_device(mode):
+    watched = Rig(mode=mode)
+    watched.lines["right D/A"].faults["deaf"] = 0.0
+
+    assert watched.go_on(20.0) == []
+
+
+def test_time_in_which_devices_are_opened_or_the_machine_stalls_does_not_count():
+    watched = Rig()
+    watched.lines["right D/A"].faults["deaf"] = 0.0
+    watched.go_on(1.0)
+    watched.jobs.busy = True
+    assert watched.go_on(10.0) == []
+    watched.jobs.busy = False
+    watched.invariants.stalled(*watched.time.stall(4.0))
+    watched.time.run_until(watched.time.now_s() + 4.0)
+
+    assert watched.go_on(1.5) == []
+    assert watched.go_on(1.0) == SAFE
+
+
+def test_a_pause_of_the_silence_between_two_ticks_counts():
+    watched = Rig()
+    line = watched.lines["right D/A"]
+    for fault in ("deaf", "mute"):
+        line.faults[fault] = 0.0
+        watched.go_on(2.0)
+        line.heal(fault)
+    assert watched.go_on(1.0) == []
+
+    line.faults["deaf"] = 0.0
+    watched.go_on(2.0)
+    line.faults["refuses"] = 0.0
+    line.heal("deaf")
+    assert watched.go_on(1.5) == SAFE
+
+
+def test_a_slow_line_is_not_silent():
+    watched = Rig()
+    watched.lines["right D/A"].faults["slow"] = 1000.0
+
+    assert watched.go_on(10.0) == []
+
+
+# ------------------------------------------------------------ travel
+
+
+@pytest.mark.parametrize(
+    ("motor_rad", "zero_rad", "velocity_rad_s", "violated"),
+    [
+        (90.0, 0.0, 5.0, ["no siderostat is driven beyond its travel"]),
+        (-90.0, 0.0, -5.0, ["no siderostat is driven beyond its travel"]),
+        (90.0, 0.0, -5.0, []),  # on its way back
+        (90.0, 0.0, 0.5, []),  # where it is held
+        (70.0, 0.0, 5.0, []),
+        (90.0, 40.0, 5.0, []),  # by the drive's count, within it
+        (70.0, -40.0, 5.0, ["no siderostat is driven beyond its travel"]),
+    ],
+)
+def test_no_motor_that_is_beyond_its_travel_is_driven_farther(
+    motor_rad, zero_rad, velocity_rad_s, violated
+):
+    watched = Rig()
+    watched.plant.loops["right"].state.motor_rad[0] = 0.0, motor_rad
+    watched.amplifiers["right"].zero_rad = 0.0, zero_rad
+    watched.invariants.velocity("right", (0.0, velocity_rad_s))
+
+    assert watched.go_on(0.1) == violated
+
+
+# ------------------------------------------------------------ rest
+
+
+def test_motors_that_turn_though_none_is_sent_a_velocity_are_noticed():
+    watched = Rig(mode=Mode.SAFE)
+    watched.amplifiers["right"].velocity_rad_s = 1.0, 0.0
+
+    assert watched.go_on(1.5) == []
+    assert watched.go_on(0.3) == ["motors stand still in OFF and SAFE"]
+
+
+def test_a_drive_that_watches_nobody_turns_on_while_it_cannot_be_reached():
+    watched = Rig(mode=Mode.SAFE)
+    amplifiers = watched.amplifiers["right"]
+    amplifiers.watches_nobody, amplifiers.velocity_rad_s = True, (1.0, 0.0)
+    amplifiers.line.faults["deaf"] = 0.0
+
+    assert watched.go_on(10.0) == []
+
+
+MOVES = ["a siderostat that nobody moves stands still in STANDBY"]
+
+
+def test_a_siderostat_moves_in_standby_only_after_a_jog():
+    watched = Rig(mode=Mode.STANDBY)
+    watched.go_on(10.0)
+    jog = Jog(az_sky_arcsec=10.0, el_sky_arcsec=0.0)
+    watched.invariants.posted(jog)
+    watched.invariants.velocity("right", (5.0, 0.0))
+    watched.go_on(1.0)
+    watched.invariants.answered(jog, Reply(accepted=True))
+    watched.go_on(2.0)
+    watched.invariants.velocity("right", (5.0, 0.0))
+    assert watched.go_on(3.0) == []
+
+    watched.invariants.velocity("right", (5.0, 0.0))
+    assert watched.go_on(0.1) == MOVES
+
+
+def test_in_standby_a_servo_may_go_back_to_where_it_was_after_a_fault():
+    watched = Rig(mode=Mode.STANDBY)
+    line = watched.lines["right siderostat"]
+    watched.go_on(10.0)
+    line.faults["slow"] = 10.0
+    watched.invariants.velocity("right", (5.0, 0.0))
+    line.heal()
+    watched.invariants.velocity("right", (5.0, 0.0))
+
+    assert watched.go_on(0.1) == []
+
+
+# ------------------------------------------------------------ the collector
+
+
+@pytest.mark.parametrize(
+    ("pose", "velocity_mm_s", "violated"),
+    [
+        (Pose(), 1.0, []),
+        (Pose(x_mm=1000.0), 1.0, ["the hexapod's poses within its travel"]),
+        (Pose(), 1000.0, ["the hexapod's velocity within its limit"]),
+    ],
+)
+def test_the_hexapod_is_sent_nothing_beyond_its_limits(pose, velocity_mm_s, violated):
+    watched = Rig(TESTBED)
+    hexapod = SwarmHexapod(
+        watched.plant, watched.time, watched.rig, Random(1), watched.invariants.pose
+    )
+    hexapod.line.connected = True
+    watched.time.spawn(lambda: hexapod.move_to(pose, velocity_mm_s), "moves")
+
+    assert watched.go_on(0.1) == violated
+
+
+@pytest.mark.parametrize("stop", [Stop(loop="left"), MoveCollector(action="stop")])
+def test_a_platform_that_moves_on_after_a_stop_is_noticed(stop):
+    watched = Rig(TESTBED)
+    watched.invariants.hexapod = SimpleNamespace(moves=True, line=watched.lines["hexapod"])
+    assert watched.go_on(5.0) == []
+    watched.invariants.answered(stop, Reply(accepted=True))
+
+    assert watched.go_on(2.9) == []
+    assert watched.go_on(0.4) == ["a stop stops the collector"]
+
+
+@pytest.mark.parametrize(
+    "after", [MoveCollector(action="start"), MoveCollector(action="reference")]
+)
+def test_a_platform_that_is_started_again_may_move(after):
+    watched = Rig(TESTBED)
+    watched.invariants.hexapod = SimpleNamespace(moves=True, line=watched.lines["hexapod"])
+    watched.invariants.answered(Stop(), Reply(accepted=True))
+    watched.invariants.answered(after, Reply(accepted=True))
+
+    assert watched.go_on(5.0) == []
+
+
+# ------------------------------------------------------------ whole runs with a defect
+
+
+def run(*happenings, rig="fit-mock.toml", duration_s=12.0):
+    plan = Plan(seed=1, rig=rig, settings=[], duration_s=duration_s, happenings=list(happenings))
+    return {one.invariant for one in run_plan(plan).violations}
+
+
+@pytest.mark.long
+def test_a_piezo_amplifier_that_is_silent_and_ignored_is_found(monkeypatch):
+    happenings = (
+        Order(at_s=0.1, who="ada", command=Standby()),
+        Strike(at_s=2.0, device="right piezo", fault="mute", lasts_s=9.5),
+    )
+    assert run(*happenings) == set()
+    monkeypatch.setattr(PiezoWatch, "evaluate", lambda *_: None)
+
+    assert set(SAFE) <= run(*happenings)
+
+
+@pytest.mark.long
+def test_a_collector_that_goes_on_after_a_stop_is_found(monkeypatch):
+    happenings = (
+        Order(at_s=0.1, who="ada", command=MoveCollector(action="reference")),
+        Order(at_s=7.0, who="ada", command=MoveCollector(action="start")),
+        Order(at_s=8.5, who="ada", command=Release()),
+        Order(at_s=9.0, who="ada", command=Stop()),
+    )
+    assert run(*happenings, rig=TESTBED, duration_s=14.0) == set()
+    monkeypatch.setattr(CollectorDrive, "stop", lambda _: None)
+
+    assert "a stop stops the collector" in run(*happenings, rig=TESTBED, duration_s=14.0)
