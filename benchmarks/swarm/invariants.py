@@ -59,6 +59,7 @@ _SAFE_S, _SAFE_BY_PIEZO_S = (
     3.0,
     8.0,
 )  # as `made_safe` in the fault catalogue, tests/faults/devices.py
+_STUCK_S = 1.0  # for so long after motors were stuck, a servo may still be behind its reference
 _RESTS_S = 1.0  # beyond the time after which a drive without its master stops by itself
 _HARDLY = 0.02  # of the velocity limit: slower, a servo corrects what its encoder counts
 _MOVED_S = 1.0  # beyond the time that a siderostat takes from one end of its travel to the other
@@ -361,6 +362,8 @@ class Invariants:
         own_az_px, own_el_px = part.spots_at_px(self._plant.row(now_s))[0, 0].tolist()
         away_px = math.hypot(tick.star_az_px - own_az_px, tick.star_el_px - own_el_px)
         follows = tick.mode in _FOLLOWING and name not in self._pointed_at
+        # The star of an image that is repeated is where the own one was, and is followed there.
+        follows = follows and not self._lines["camera"].was_wrong("frozen", _MOST_WRONG_S)
         if not (follows and away_px >= _ANOTHERS_PX):  # nor without a star
             self._wrong_since_s.pop(name, None)
             return
@@ -386,10 +389,16 @@ class Invariants:
             stop_s = self._stop_answered_s.get(name, -math.inf)
             if self._power_up_s.get(name, math.inf) < stop_s:
                 self.violated("a stop has the last word", f"{name}: powered up after it")
-        if "following error below" in change.reason:
+        if "following error below" in change.reason and not self._was_stuck(name):
             self.violated("an axis that is not stuck is not called so", f"{name}: {change.reason}")
         if change.trigger == Trigger.FAULT.name and self.nothing_fails:
             self.violated("without a fault nothing fails", f"{name}: {change.reason}")
+
+    def _was_stuck(self, name: str) -> bool:
+        """Its motors do not move, or did not until recently, or did not before a stall that ended recently."""
+        stalled = self._clock.now_s() - self._stall_ended_s < _STUCK_S
+        within_s = _MOST_WRONG_S if stalled else _STUCK_S
+        return self._lines[f"{name} siderostat"].was_wrong("stuck", within_s)
 
     def _reported(self, event: Event) -> None:
         if event.severity == "error" and event.source in self._rig.loops:
@@ -454,7 +463,8 @@ class Invariants:
         line = self._lines[f"{name} siderostat"]
         moves_s = max(since_s, self._jogged_s.get(name, 0.0), line.healed_s, self._stall_ended_s)
         rested_s = self._clock.now_s() - moves_s
-        if not line.faults and rested_s > self._moved_s[name]:
+        # Motors that do not move are commanded on, until the servo notices.
+        if not line.faults and not line.wrong and rested_s > self._moved_s[name]:
             self.violated(
                 "a siderostat that nobody moves stands still in STANDBY",
                 f"{name}: {velocity_rad_s} rad/s {rested_s:.3f} s after it was moved",
@@ -528,21 +538,36 @@ class Invariants:
         self._collector_rests(now_s)
 
     def _safe_in_time(self, name: str, mode: Mode, now_s: float) -> None:
-        """A loop with a device that has been silent for long is in SAFE or OFF."""
+        """A loop with a device that has been silent, or has reported a fault, for long is in SAFE or OFF."""
         for device, most_s in self._needed[name]:
             line = self._lines[device]
-            silent_s = self._silent.lasted_s(
-                f"{name}: {device}",
-                is_so=mode not in _AT_REST and line.is_silent,
-                now_s=now_s,
-                from_s=line.answered_s,
-            )
-            if silent_s > most_s:
-                how = ", ".join(sorted(line.faults)) or "not connected"
-                self.violated(
-                    "a loop without one of its devices is SAFE in time",
-                    f"{name}: in {mode.name} after {device} was silent for {silent_s:.2f} s ({how})",
+            # A slow line has fewer answers that report a fault.
+            fault = "" if "slow" in line.faults else self._fault_of(name, device)
+            states = {
+                "silent": (line.is_silent, line.answered_s),
+                "failing": (fault, line.healed_s),
+            }
+            for state, (is_so, from_s) in states.items():
+                lasted_s = self._silent.lasted_s(
+                    f"{name}: {device} {state}",
+                    is_so=mode not in _AT_REST and bool(is_so),
+                    now_s=now_s,
+                    from_s=from_s,
                 )
+                if lasted_s > most_s:
+                    how = ", ".join([*line.faults, *line.wrong, *filter(None, [fault])])
+                    self.violated(
+                        "a loop without one of its devices is SAFE in time",
+                        f"{name}: in {mode.name} after {device} was {state} for {lasted_s:.2f} s ({how})",
+                    )
+
+    def _fault_of(self, name: str, device: str) -> str:
+        """The fault that a device reports whenever it answers, if that demands SAFE."""
+        kind = device.rpartition(" ")[2]
+        if kind == "siderostat":
+            return self._amplifiers[name].fault
+        wrong = self._lines[device].wrong
+        return ", ".join(sorted(wrong)) if kind == "piezo" else ""
 
     def _turns(self, name: str, mode: Mode, now_s: float) -> None:
         """Motors stand still in OFF and SAFE, unless their drive watches nobody and cannot be reached."""

@@ -23,6 +23,18 @@ _SLICE_S = 0.0005
 FAULTS = ("slow", "deaf", "mute", "refuses", "garbled", "unplugged")
 """Faults of a line, in this order: late answers, lost requests, lost answers, a device that refuses,
 answers that make no sense, and a cable that is unplugged."""
+WRONG: dict[str, tuple[str, ...]] = {
+    "siderostat": ("trip", "stuck"),
+    "piezo": ("stuck", "limit"),
+    "camera": ("frozen", "drops", "saturated"),
+    "photodiodes": ("saturated",),
+}
+"""Faults of a device whose line is well, by kind of device.
+
+Amplifiers detect a fault of their own, or motors do not move. A stack has the highest voltage, or the limit
+switch is at another voltage. The camera repeats an image, loses half of its frames, or has all pixels at full
+scale. Photodiodes are at the end of their range.
+"""
 SILENCE = frozenset(FAULTS) - {"slow"}
 """Faults during which no answer arrives that makes sense."""
 
@@ -66,6 +78,10 @@ class Line:
     ----------
     faults : dict of str to float
         The faults in force, from `FAULTS`. The value of "slow" is the factor.
+    wrong : dict of str to float
+        The faults in force, from `WRONG`. The value of "stuck" of a piezo amplifier is the stack.
+    wrong_until_s : dict of str to float
+        When each of those ended last.
     healed_s : float
         When the last fault ended.
     answered_s : float
@@ -88,6 +104,8 @@ class Line:
         self.device = device
         self.endpoint = endpoint
         self.faults: dict[str, float] = {}
+        self.wrong: dict[str, float] = {}
+        self.wrong_until_s: dict[str, float] = {}
         self.healed_s = self.answered_s = -math.inf
         self.connected = False
         self.bus: Bus | None = None
@@ -98,11 +116,18 @@ class Line:
 
     def heal(self, *faults: str) -> None:
         """End these faults, or all of them if none is named."""
-        for fault in faults or list(self.faults):
-            self.faults.pop(fault, None)
         self.healed_s = self._time.now_s()
+        for fault in faults or [*self.faults, *self.wrong]:
+            self.faults.pop(fault, None)
+            if self.wrong.pop(fault, None) is not None:
+                self.wrong_until_s[fault] = self.healed_s
         if not self.faults.keys() & SILENCE:
             self.answered_s = self.healed_s
+
+    def was_wrong(self, fault: str, within_s: float) -> bool:
+        """A fault from `WRONG` is in force, or was until recently."""
+        until_s = self.wrong_until_s.get(fault, -math.inf)
+        return fault in self.wrong or self._time.now_s() - until_s < within_s
 
     @property
     def is_silent(self) -> bool:

@@ -8,7 +8,7 @@ from random import Random
 
 import msgspec
 
-from benchmarks.swarm.lines import FAULTS, drawn_slowness
+from benchmarks.swarm.lines import FAULTS, WRONG, drawn_slowness
 from fitctl.messages.commands import (
     Acquire,
     AnyCommand,
@@ -77,9 +77,24 @@ _PLACES, _FEW_PLACES = 3, 0.5  # fraction of runs whose targets are only so many
 _SLOW_SLEW = 0.4  # fraction of interrupted slews on a slow line
 _SLEW_S = 1.5  # a slew is interrupted within this time of its beginning,
 _MEETS_S = 0.1  # and a stall follows within this
+_WRONG = 0.25  # fraction of strikes with wrong values, on devices that can have some
+_SKY, _TOLD = (
+    0.15,
+    0.5,
+)  # fraction of runs with each change of the sky; of those that the rig file knows
+PHOTON_NOISE = "camera.electrons_per_dn=1.0"
 _AT_ONCE_S = 0.004  # mean delay between hurried commands
 _LONG_STALL, _SILENT = 0.3, 0.5  # fractions of disturbed rests
 _BURST, _BURST_S = 0.4, 0.05  # fraction of happenings that follow another at once, and mean delay
+
+
+AT_ONCE = frozenset({"reset", "power cut", "trip"})
+"""Faults without a duration. A drive that has tripped stays so until it is opened again."""
+
+
+def kind_of(device: str) -> str:
+    """A device's name without its loop."""
+    return device.rpartition(" ")[2]
 
 
 class _Happening(msgspec.Struct, frozen=True, kw_only=True):
@@ -104,7 +119,7 @@ class Order(_Happening, frozen=True, kw_only=True, tag="order"):
 
 
 class Strike(_Happening, frozen=True, kw_only=True, tag="strike"):
-    """A fault of one device, and how long it lasts; a reset or a power cut has no duration."""
+    """A fault of one device, and how long it lasts; what happens at once has no duration."""
 
     device: str
     fault: str
@@ -114,7 +129,7 @@ class Strike(_Happening, frozen=True, kw_only=True, tag="strike"):
     @property
     def kind(self) -> str:
         """The name used in the statistics."""
-        return f"{self.device.rpartition(' ')[2]} {self.fault}"
+        return f"{kind_of(self.device)} {self.fault}"
 
 
 class Stall(_Happening, frozen=True, kw_only=True, tag="stall"):
@@ -257,6 +272,70 @@ def several_writes(rig: str) -> list[str]:
     ]
 
 
+def stars_of(rig: str) -> list[str]:
+    """The loops of a rig that point a star."""
+    return [loop for loop in RIGS[rig] if loop != "metrology"]
+
+
+def vibrating(rig: str, frequency_hz: float, rms_px: float, direction_deg: float) -> list[str]:
+    """Settings with a vibration in the motion of a rig's stars."""
+    line = (
+        f"{{frequency_hz={frequency_hz:.2f}, rms_px={rms_px:.3f}, direction_deg={direction_deg:.1f}, "
+        "damping=0.01, drift_hz_per_min=0.0}"
+    )
+    return [f"plant.loops.{loop}.lines=[{line}]" for loop in stars_of(rig)]
+
+
+def moving(rig: str, az_arcsec_s: float, el_arcsec_s: float, *, told: bool) -> list[str]:
+    """Settings with stars that move by themselves, as the rig file knows if it is `told`.
+
+    They begin nearer to the start, so that a search about the start finds them however long the run is.
+    """
+    rate = f"star_rate_sky_arcsec_s={{az={az_arcsec_s:.3f}, el={el_arcsec_s:.3f}}}"
+    return [
+        setting
+        for loop in stars_of(rig)
+        for setting in (
+            f"plant.loops.{loop}.{rate}",
+            f"plant.loops.{loop}.star_offset_sky_arcsec_max=150.0",
+            *([f"loops.{loop}.{rate}"] if told else []),
+        )
+    ]
+
+
+def with_another_spot(rig: str, *, told: bool) -> list[str]:
+    """Settings with one more spot in the field of the only star of a rig, too dim for a star.
+
+    On a rig with two stars it would interfere with the spots of the other one.
+    """
+    if len(stars_of(rig)) > 1:
+        return []
+    loop, fringe = stars_of(rig)[0], 'name="fringe", offset_px={az=-12.0, el=0.0}, flux_dn=11000.0'
+    other = 'name="other", offset_px={az=10.0, el=9.0}, flux_dn=6000.0'
+    star = 'name="pointing", offset_px={az=0.0, el=0.0}, flux_dn=28000.0'
+    true = ", ".join(f"{{{spot}, diameter_px=3.0}}" for spot in (star, fringe, other))
+    known = f"loops.{loop}.other_spots=[{{{fringe}}}, {{{other}}}]"
+    return [f"plant.loops.{loop}.spots=[{true}]", *([known] if told else [])]
+
+
+def drawn_sky(random: Random, rig: str) -> list[str]:
+    """Settings of the light and of the stars, most often none."""
+    settings = [PHOTON_NOISE] if random.random() < _SKY else []
+    if random.random() < _SKY:
+        settings += vibrating(
+            rig, random.uniform(1.0, 20.0), random.uniform(0.02, 0.3), random.uniform(0.0, 180.0)
+        )
+    if random.random() < _SKY:
+        told = random.random() < _TOLD
+        # Without being told, Eq. 20 has the mirror at its limit from 0.3 arcsec/s on.
+        most_arcsec_s = 0.3 if told else 0.15
+        az_arcsec_s, el_arcsec_s = (random.uniform(-most_arcsec_s, most_arcsec_s) for _ in range(2))
+        settings += moving(rig, az_arcsec_s, el_arcsec_s, told=told)
+    if random.random() < _SKY:
+        settings += with_another_spot(rig, told=random.random() < _TOLD)
+    return settings
+
+
 def devices_of(rig: str) -> list[str]:
     """The devices of a rig."""
     devices = ["camera"]
@@ -352,7 +431,7 @@ def _drawn_settings(random: Random, rig: str, *, fast: bool) -> list[str]:
         settings += slow_servos(rig, random.randrange(2))
     if not fast and random.random() < _SEVERAL_WRITES:
         settings += several_writes(rig)
-    return settings
+    return settings + drawn_sky(random, rig)
 
 
 def _drawn_command(
@@ -368,15 +447,21 @@ def _drawn_command(
 
 def _strike(random: Random, at_s: float, devices: list[str], faults: list[str]) -> list[Happening]:
     device, fault = random.choice(devices), random.choice(faults)
+    wrong = WRONG.get(kind_of(device), ())
+    if wrong and random.random() < _WRONG:
+        fault = random.choice(wrong)
     if fault == "power cut" and not device.endswith("siderostat"):
         fault = "reset"  # only encoders forget anything
+    size = drawn_slowness(random) if fault == "slow" else 0.0
+    if kind_of(device) == "piezo" and fault == "stuck":
+        size = float(random.randrange(3))
     return [
         Strike(
             at_s=at_s,
             device=device,
             fault=fault,
-            lasts_s=0.0 if fault in {"reset", "power cut"} else 10 ** random.uniform(-2.0, 1.0),
-            size=drawn_slowness(random) if fault == "slow" else 0.0,
+            lasts_s=0.0 if fault in AT_ONCE else 10 ** random.uniform(-2.0, 1.0),
+            size=size,
         )
     ]
 

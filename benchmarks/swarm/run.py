@@ -23,7 +23,7 @@ from benchmarks.swarm.devices.hexapod import SwarmHexapod
 from benchmarks.swarm.devices.mirror import SwarmDac, SwarmPiezo
 from benchmarks.swarm.devices.sensors import SwarmCamera, SwarmPhotodiodes
 from benchmarks.swarm.invariants import Invariants, Violation
-from benchmarks.swarm.lines import Bus, Line
+from benchmarks.swarm.lines import FAULTS, Bus, Line
 from benchmarks.swarm.plan import (
     ClockStep,
     Cloud,
@@ -89,6 +89,7 @@ _SEQUENCE_ENDS_S = 15.0
 _MOST_DESIGN_S = 20.0
 _NOISE_STEP = 1.05
 _SAVED_S = 1.0  # so often a supervisor leaves where its stars are
+_MISLED_S = 10.0  # for so long after a repeated image, a loop may still follow what it showed
 _BACK_S = 15.0  # after a kill or a shutdown, and what was waited for when all was healed
 _LEADS_ON: dict[Mode, type[Standby | Recover | Acquire]] = {
     Mode.OFF: Standby,
@@ -107,6 +108,11 @@ def _design_once(
 ) -> Design:
     """Designs are the same for every seed."""
     return design_for(load_rig(RIGS / rig_file, settings), name, controller, noise_px)
+
+
+def _is_of_designs(setting: str) -> bool:
+    """Whether a design may depend on a setting of the rig."""
+    return setting.startswith("camera.") or ".vernier." in setting or ".writes_per_frame" in setting
 
 
 class Result(msgspec.Struct, frozen=True, kw_only=True):
@@ -344,10 +350,10 @@ class Instrument:
         if self._designs_take_time:  # those of the start come before time goes on
             self.time.sleep(self._design_random.uniform(0.5, _MOST_DESIGN_S))
         plan = self._plan
-        of_camera = tuple(text for text in plan.settings if text.startswith("camera."))
+        of_designs = tuple(text for text in plan.settings if _is_of_designs(text))
         if noise_px is not None:  # so many clouds would have too many designs made
             noise_px = _NOISE_STEP ** round(math.log(noise_px, _NOISE_STEP))
-        return _design_once(plan.rig, of_camera, name, controller, noise_px)
+        return _design_once(plan.rig, of_designs, name, controller, noise_px)
 
     def _record(self, record: AnyRecord) -> None:
         self._digest.update(self._encode(record))
@@ -359,6 +365,8 @@ class Instrument:
             self.modes[record.target] = self.modes.get(record.target, 0) + 1
             if record.target == Mode.COARSE.name and record.loop in self.rig.stellar_loops:
                 self.found_s.setdefault(record.loop, record.time_s)
+        if self.found_s and self.camera.line.was_wrong("frozen", _MISLED_S):
+            self.found_s.clear()  # a repeated image has a star where none is: its place may be wrong
         self._on_record(record)
 
     # ------------------------------------------------------------ operators
@@ -443,16 +451,23 @@ class Instrument:
             case Cloud():
                 self._dim(happening.part)
                 self.time.call_at(self.time.now_s() + happening.lasts_s, partial(self._dim, 1.0))
-            case Strike(fault="reset"):
-                self.resets[happening.device]()
-            case Strike(fault="power cut"):
-                self._cut_power(happening.device.removesuffix(" siderostat"))
-            case Strike():
-                line = self.lines[happening.device]
-                line.faults[happening.fault] = happening.size
-                self.time.call_at(
-                    self.time.now_s() + happening.lasts_s, partial(line.heal, happening.fault)
-                )
+            case Strike(device=device):
+                self._strike(happening, device.removesuffix(" siderostat"))
+
+    def _strike(self, strike: Strike, loop_name: str) -> None:
+        """Let a fault begin; one with a duration ends after it. `loop_name` is that of a siderostat."""
+        match strike.fault:
+            case "reset":
+                self.resets[strike.device]()
+            case "power cut":
+                self._cut_power(loop_name)
+            case "trip":
+                self.amplifiers[loop_name].trip()
+            case fault:
+                line = self.lines[strike.device]
+                in_force = line.faults if fault in FAULTS else line.wrong
+                in_force[fault] = strike.size
+                self.time.call_at(self.time.now_s() + strike.lasts_s, partial(line.heal, fault))
 
     def _cut_power(self, name: str) -> None:
         """Restart a loop's encoders at zero; the places of the stars that it turns are unknown from then on.

@@ -1,6 +1,7 @@
 """What the swarm has beside the supervisor: recorder, service, console, sequences, and their invariants."""
 
 from random import Random
+from typing import get_args
 
 import msgspec
 import numpy as np
@@ -9,13 +10,16 @@ import pytest
 from benchmarks.swarm.clients import STEPS
 from benchmarks.swarm.devices.amplifiers import SwarmAmplifiers
 from benchmarks.swarm.invariants import Invariants
+from benchmarks.swarm.lines import FAULTS, WRONG, Line
 from benchmarks.swarm.past import put_back
 from benchmarks.swarm.plan import (
     _SETTINGS,
     _SLOW,
+    PHOTON_NOISE,
     RIGS,
     Cloud,
     FullDisk,
+    Happening,
     Kill,
     Order,
     Plan,
@@ -23,8 +27,14 @@ from benchmarks.swarm.plan import (
     Sequence,
     Stall,
     Strike,
+    devices_of,
     drawn_plan,
+    kind_of,
+    moving,
+    several_writes,
     slow_servos,
+    vibrating,
+    with_another_spot,
 )
 from benchmarks.swarm.recorder import ZMQ, SwarmRecorder
 from benchmarks.swarm.run import RIGS as FOLDER
@@ -58,6 +68,8 @@ from fitctl.service.admission import Admission
 from fitctl.stages.servo import SiderostatServo
 from fitctl.tui.state import ConsoleState
 from tests.samples.log_samples import tick
+
+KINDS = {kind_of(device) for device in devices_of("fit-testbed.toml")}
 
 
 def plan(*happenings, duration_s=8.0, rig="fit-mock.toml", settings=()):
@@ -144,7 +156,8 @@ def plant():
 
 @pytest.fixture
 def invariants(time, plant):
-    return Invariants(load_rig(FOLDER / "fit-mock.toml"), time, {}, {}, plant)
+    lines = {"camera": Line("camera", "", time, Random(1), 0.001, 0.1)}
+    return Invariants(load_rig(FOLDER / "fit-mock.toml"), time, {}, lines, plant)
 
 
 STATUS = RecorderStatus(time_s=0.0, path="", records=0, lost=0, bytes_written=0)
@@ -207,6 +220,12 @@ def test_a_loop_may_see_its_own_star_or_another_for_a_while(
     assert follow(invariants, plant, seconds, away_px, mode) == []
 
 
+def test_a_loop_may_follow_what_a_frozen_camera_shows(invariants, plant):
+    invariants._lines["camera"].wrong["frozen"] = 0.0
+
+    assert follow(invariants, plant, 12, 7.0) == []
+
+
 def test_a_loop_may_follow_a_star_that_a_person_pointed_at(invariants, plant):
     invariants.answered(Look(az_px=20.0, el_px=20.0), Reply(accepted=True))
 
@@ -234,16 +253,63 @@ def test_every_setting_is_one_that_the_rig_can_have(rig):
     load_rig(FOLDER / rig, list(_SETTINGS))
     for which in range(2) if rig in _SLOW else ():
         load_rig(FOLDER / rig, [*_SETTINGS, *slow_servos(rig, which)])
+    for told in (False, True):
+        skies = [
+            *vibrating(rig, 20.0, 0.3, 180.0),
+            *moving(rig, 0.3, -0.3, told=told),
+            *with_another_spot(rig, told=told),
+        ]
+        load_rig(FOLDER / rig, [*_SETTINGS, *several_writes(rig), PHOTON_NOISE, *skies])
+
+
+def test_a_setting_of_the_sky_is_true_of_each_star_and_known_if_it_is_told():
+    rig = "two-stars.toml"
+    loaded = [load_rig(FOLDER / rig, moving(rig, 0.2, -0.1, told=told)) for told in (False, True)]
+
+    for each in loaded:
+        rates = [star.star_rate_sky_arcsec_s for star in each.plant.stellar_loops.values()]
+        assert [(rate.az, rate.el) for rate in rates] == [(0.2, -0.1)] * 2
+    known = [
+        [loop.star_rate_sky_arcsec_s for loop in each.stellar_loops.values()] for each in loaded
+    ]
+    assert known[0] == [None, None]
+    assert [(rate.az, rate.el) for rate in known[1]] == [(0.2, -0.1)] * 2
 
 
 def test_plans_have_every_kind_of_happening():
-    kinds = {
-        type(happening)
-        for seed in range(40)
-        for happening in drawn_plan(Random(seed), seed, "fit-mock.toml").happenings
-    }
+    happenings = [
+        happening
+        for seed in range(250)
+        for happening in drawn_plan(Random(seed), seed, "fit-testbed.toml").happenings
+    ]
 
-    assert kinds >= {Order, Stall, Kill, Cloud, RecorderDeath, FullDisk, Sequence}
+    assert {type(happening) for happening in happenings} == set(get_args(Happening))
+    of_lines = {(device, fault) for device in KINDS for fault in (*FAULTS, "reset")}
+    wrong = {(device, fault) for device, faults in WRONG.items() for fault in faults}
+    struck = {
+        (kind_of(happening.device), happening.fault)
+        for happening in happenings
+        if isinstance(happening, Strike)
+    }
+    assert struck == of_lines | wrong | {("siderostat", "power cut")}
+
+
+def test_plans_have_every_sky():
+    settings = " ".join(
+        text
+        for seed in range(100)
+        for text in drawn_plan(Random(seed), seed, "fit-mock.toml").settings
+    )
+
+    for key in (
+        "camera.electrons_per_dn",
+        "plant.loops.right.lines",
+        "plant.loops.right.star_rate_sky_arcsec_s",
+        " loops.right.star_rate_sky_arcsec_s",
+        "plant.loops.right.spots",
+        " loops.right.other_spots",
+    ):
+        assert key in f" {settings}"
 
 
 @pytest.mark.long

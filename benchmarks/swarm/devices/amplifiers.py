@@ -228,7 +228,7 @@ class SwarmAmplifiers:
         self.zero_rad = self._inner.exchange(_STILL).position_rad
 
     def trip(self) -> None:
-        """Detect an internal fault and remove power from the motors."""
+        """Detect an internal fault and remove power from the motors, until the fault is reset."""
         self._power_down()
         self.fault = "overcurrent"
 
@@ -280,7 +280,7 @@ class SwarmAmplifiers:
             inner.enable()  # the watchdog dropped the enable lines; a write restores them
             self.powered = True
         if self.powered:
-            reading = inner.exchange(velocity_rad_s)
+            reading = inner.exchange(_STILL if "stuck" in self.line.wrong else velocity_rad_s)
             if not self._watched:
                 self._watched = True
                 self._time.call_at(self._last_master_s + self.master_timeout_s, self._watch)

@@ -113,7 +113,6 @@ class SwarmPiezo:
         self.line = Line(
             "piezo amplifier", piezo.port, time, random, 0.03, piezo.response_timeout_s
         )
-        self.stuck_stack: int | None = None
         self._limit_v = piezo.limit_v
         self._mirror = mirror
 
@@ -125,16 +124,16 @@ class SwarmPiezo:
         return identity("piezo amplifier")
 
     def stack_volts(self) -> Floats:
-        """Measure the stacks; a stuck stack reads the limit."""
+        """Measure the stacks; one that is stuck has the highest voltage."""
         volts = np.array([self.line.ask(self._mirror.stack_volts)[stack] for stack in range(3)])
-        if self.stuck_stack is not None:
-            volts[self.stuck_stack] = self._limit_v
+        if "stuck" in self.line.wrong:
+            volts[int(self.line.wrong["stuck"])] = self._limit_v
         return volts
 
     def limit_v(self) -> float:
-        """Read the limit switch."""
+        """Read the limit switch, as the driver does: another limit than the rig file's is an error."""
         limit_v = self.line.ask(self._mirror.limit_v)
-        if not math.isclose(limit_v, self._limit_v):
+        if "limit" in self.line.wrong:
             raise DeviceMismatch("piezo amplifier", self.line.endpoint, "its limit", "another")
         return limit_v
 

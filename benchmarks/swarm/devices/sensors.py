@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from random import Random
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from benchmarks.swarm.lines import Line, identity
 from benchmarks.swarm.threads import VirtualTime
 from fitctl.config import Rig
+from fitctl.config.devices import FULL_SCALE_DN
 from fitctl.drivers.interface import (
     CameraCounts,
     DeviceIdentity,
@@ -26,6 +28,7 @@ from fitctl.simulation.devices import (
 Floats = NDArray[np.float64]
 _SILENCE = frozenset({"deaf", "mute", "refuses", "garbled"})
 _MOST_LATE_FRAMES = 20
+_DROPPED = 0.5  # of the frames
 
 
 class SwarmCamera(SimulatedCamera):
@@ -37,6 +40,9 @@ class SwarmCamera(SimulatedCamera):
         self.line = Line("camera", device.endpoint, time, random, 0.002, device.response_timeout_s)
         self._time = time
         self._period_s = rig.camera.period_s
+        self._random = random
+        self._image: NDArray[Any] | None = None  # of the newest frame
+        self._full_scale_dn = FULL_SCALE_DN[rig.camera.device.pixel_format]
         self._streams = False
         self._lost = 0
         self._clear_dn = self._scene._flux_dn
@@ -78,12 +84,20 @@ class SwarmCamera(SimulatedCamera):
         if arrives_s > now_s + timeout_s + 1e-9:
             self._time.sleep_until(now_s + timeout_s)
             return None
+        if "drops" in self.line.wrong and self._random.random() < _DROPPED:
+            self._frames += 1
+            self._lost += 1
+            return self.next_frame(timeout_s)
         self._time.sleep_until(arrives_s)
         self._frames += 1
         self._exposures += 1
-        spots = self._plant.exposure_px(exposed_s)[0]
-        noise_dn = self._plant.pixel_noise_dn(exposed_s)
-        image = self._scene.frame(spots, self._pixel_key, self._exposures, noise_dn)
+        if self._image is None or "frozen" not in self.line.wrong:
+            spots = self._plant.exposure_px(exposed_s)[0]
+            noise_dn = self._plant.pixel_noise_dn(exposed_s)
+            self._image = self._scene.frame(spots, self._pixel_key, self._exposures, noise_dn)
+        image = self._image
+        if "saturated" in self.line.wrong:
+            image = np.full_like(image, self._full_scale_dn)
         return Frame(self._frames, exposed_s, self._time.now_s(), image)
 
     def counts(self) -> CameraCounts:
@@ -144,6 +158,8 @@ class SwarmPhotodiodes(SimulatedPhotodiodes):
         self._round_trip_s = self._usual_s * faults.get("slow", 1.0)
         silent = bool(faults.keys() & _SILENCE)
         reading = None if silent else super().receive()
+        if reading is not None and "saturated" in self.line.wrong:
+            reading = reading._replace(volts=(self._range_v,) * 4)
         now_s = self._clock.now_s()
         if reading is not None or not self._requested_s:
             return reading

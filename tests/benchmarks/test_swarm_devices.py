@@ -1,0 +1,207 @@
+"""Devices of the swarm whose line is well and whose values are wrong."""
+
+from functools import partial
+from itertools import pairwise
+from random import Random
+
+import pytest
+
+from benchmarks.swarm.devices.amplifiers import SwarmAmplifiers
+from benchmarks.swarm.devices.mirror import SwarmPiezo
+from benchmarks.swarm.devices.sensors import SwarmCamera, SwarmPhotodiodes
+from benchmarks.swarm.plan import Order, Plan, Strike
+from benchmarks.swarm.run import RIGS as FOLDER
+from benchmarks.swarm.run import run_plan
+from benchmarks.swarm.threads import VirtualTime
+from fitctl.config import load_rig
+from fitctl.drivers.interface import DeviceFault, DeviceMismatch
+from fitctl.logging.records import ModeChange
+from fitctl.model.plant import Plant
+from fitctl.simulation.devices import SimulatedMirror
+
+RIG = load_rig(FOLDER / "fit-testbed.toml")
+
+
+@pytest.fixture
+def time():
+    time = VirtualTime()
+    yield time
+    time.end()
+
+
+@pytest.fixture
+def plant():
+    return Plant(RIG, [1], history_s=20.0)
+
+
+@pytest.fixture
+def does(time):
+    """Does something in a thread of virtual time, which may wait; returns what that gave or raised."""
+
+    def does(action):
+        given = []
+
+        def thread():
+            try:
+                given.append(action())
+            except Exception as error:
+                given.append(error)
+
+        time.spawn(thread, "does")
+        while not given:
+            time.run_until(time.now_s() + 0.01)
+        return given[0]
+
+    return does
+
+
+@pytest.fixture
+def camera(time, plant, does):
+    camera = SwarmCamera(RIG, time, plant, Random(1))
+    does(camera.open)
+    does(camera.start)
+    return camera
+
+
+def frames(camera, count=40):
+    return [camera.next_frame(0.1) for _ in range(count)]
+
+
+def test_a_frozen_camera_repeats_its_newest_image_in_new_frames(camera, does):
+    (before,) = does(partial(frames, camera, 1))
+    camera.line.wrong["frozen"] = 0.0
+    frozen = does(partial(frames, camera))
+    camera.line.heal()
+    (after,) = does(partial(frames, camera, 1))
+
+    assert all((frame.image == before.image).all() for frame in frozen)
+    assert all(later.number == sooner.number + 1 for sooner, later in pairwise(frozen))
+    assert (after.image != before.image).any()
+
+
+def test_a_camera_that_drops_frames_counts_them(camera, does):
+    camera.line.wrong["drops"] = 0.0
+    got = does(partial(frames, camera))
+    numbers = [frame.number for frame in got if frame is not None]
+    skipped = numbers[-1] - len(numbers)
+
+    assert 15 < skipped < 80
+    assert camera.counts().lost == skipped
+
+
+def test_a_saturated_camera_has_all_pixels_at_full_scale(camera, does):
+    camera.line.wrong["saturated"] = 0.0
+
+    assert (does(partial(frames, camera, 1))[0].image == 65535).all()
+
+
+@pytest.fixture
+def amplifiers(time, plant, does):
+    def ignore(*_):
+        pass
+
+    amplifiers = SwarmAmplifiers(
+        plant.loops["right"], time, RIG, "right", Random(1), ignore, ignore, ignore
+    )
+    does(amplifiers.open)
+    does(amplifiers.enable)
+    return amplifiers
+
+
+def turned_rad(amplifiers, does):
+    def turn():
+        for _ in range(50):
+            reading = amplifiers.exchange((5.0, 0.0))
+        return reading
+
+    return does(turn).position_rad[0]
+
+
+def test_motors_that_are_stuck_do_not_move_until_they_come_free(amplifiers, does):
+    amplifiers.line.wrong["stuck"] = 0.0
+    assert turned_rad(amplifiers, does) == 0.0
+    amplifiers.line.heal()
+
+    assert turned_rad(amplifiers, does) > 0.05
+
+
+def test_amplifiers_that_trip_have_no_power_until_their_fault_is_reset(amplifiers, does):
+    amplifiers.trip()
+
+    assert not amplifiers.powered
+    assert isinstance(does(amplifiers.enable), DeviceFault)
+    does(amplifiers.reset_fault)
+    does(amplifiers.enable)
+    assert amplifiers.powered
+
+
+def test_a_piezo_amplifier_has_a_stack_at_its_limit_or_another_limit(time, plant, does):
+    mirror = SimulatedMirror(plant.loops["right"], time, RIG, "right")
+    piezo = SwarmPiezo(mirror, time, RIG, "right", Random(1))
+    does(piezo.open)
+    volts = does(piezo.stack_volts)
+    piezo.line.wrong["stuck"] = 1.0
+
+    assert does(piezo.stack_volts).tolist() == [volts[0], does(piezo.limit_v), volts[2]]
+    piezo.line.wrong["limit"] = 0.0
+    assert isinstance(does(piezo.limit_v), DeviceMismatch)
+
+
+def test_photodiodes_are_at_the_end_of_their_range(time, plant, does):
+    photodiodes = SwarmPhotodiodes(plant.loops["metrology"], time, RIG, "metrology", Random(1))
+    does(photodiodes.open)
+    photodiodes.line.wrong["saturated"] = 0.0
+    photodiodes.send_request()
+    time.run_until(time.now_s() + 0.1)
+    sensor = RIG.metrology_loops["metrology"].sensor
+
+    volts = photodiodes.receive().volts
+    assert volts == (sensor.device.range_v,) * 4
+    assert min(volts) >= sensor.saturated_v
+
+
+# ------------------------------------------------------------ whole runs
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("device", "fault", "reason"),
+    [
+        ("right siderostat", "trip", "overcurrent"),
+        ("right siderostat", "stuck", "following error"),
+        ("right piezo", "stuck", "stack 2"),
+        ("right piezo", "limit", "its limit"),
+    ],
+)
+def test_a_wrong_value_leads_to_safe_and_violates_nothing(device, fault, reason):
+    reasons = []
+
+    def on_record(record):
+        if isinstance(record, ModeChange) and record.target == "SAFE":
+            reasons.append(record.reason)
+
+    happenings = [
+        Order(at_s=0.1, who="ada"),
+        Order(at_s=2.0, who="ada"),  # the search moves the siderostat
+        Strike(at_s=2.5, device=device, fault=fault, lasts_s=4.0, size=1.0),
+    ]
+    plan = Plan(seed=1, rig="fit-mock.toml", settings=[], duration_s=8.0, happenings=happenings)
+
+    assert run_plan(plan, on_record).violations == []
+    assert reason in reasons[0]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("device", ["camera", "metrology photodiodes"])
+def test_a_sensor_with_wrong_values_violates_nothing(device):
+    faults = ("frozen", "drops", "saturated") if device == "camera" else ("saturated",)
+    happenings = [
+        *[Order(at_s=at_s, who="ada") for at_s in (0.1, 2.0, 4.0)],
+        *[
+            Strike(at_s=25.0 + 14.0 * number, device=device, fault=fault, lasts_s=9.0)
+            for number, fault in enumerate(faults)
+        ],
+    ]
+    plan = Plan(seed=1, rig="fit-testbed.toml", settings=[], duration_s=70.0, happenings=happenings)
+
+    assert run_plan(plan).violations == []
