@@ -376,9 +376,16 @@ class Invariants:
             )
 
     def _camera_well(self) -> bool:
-        """Nothing has been wrong with the camera's line for a while."""
+        """Nothing has been wrong with the camera's line for a while, and it loses no frames.
+
+        If each frame that came during a stall is lost, one from before the stall is the newest.
+        """
         line = self._lines["camera"]
-        return not line.faults and self._clock.now_s() - line.healed_s > _WELL_S
+        return (
+            not line.faults
+            and "drops" not in line.wrong
+            and self._clock.now_s() - line.healed_s > _WELL_S
+        )
 
     def _mode_changed(self, change: ModeChange) -> None:
         name = change.loop

@@ -85,6 +85,8 @@ _SKY, _TOLD = (
 PHOTON_NOISE = "camera.electrons_per_dn=1.0"
 _AT_ONCE_S = 0.004  # mean delay between hurried commands
 _LONG_STALL, _SILENT = 0.3, 0.5  # fractions of disturbed rests
+_COLLECTOR = 0.4  # fraction of the testbed's runs in which its collector is moved on purpose
+_REFERENCED_S = 7.0  # until a reference move has ended
 _BURST, _BURST_S = 0.4, 0.05  # fraction of happenings that follow another at once, and mean delay
 
 
@@ -380,6 +382,8 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
         strikes += [partial(_strike, devices=struck, faults=faults)] * random.randint(1, 6)
         strikes += [partial(_interrupted_slew, loops=loops)] * random.randint(0, 4)
         strikes += [partial(_disturbed_rest, loops=loops)] * random.randint(0, 2)
+    if "metrology" in loops and random.random() < _COLLECTOR:
+        strikes += [partial(_moved_collector, loops=loops)] * random.randint(1, 2)
     every_s, fault_part = 10 ** random.uniform(-0.3, 1.0), random.uniform(0.05, 0.6)
     # The service refuses commands from operators without the lease.
     people = OPERATORS[: random.randint(1, len(OPERATORS))]
@@ -508,6 +512,19 @@ def _disturbed_rest(random: Random, at_s: float, loops: tuple[str, ...]) -> list
         if command is not None
     ]
     return [*orders, *others]
+
+
+def _moved_collector(random: Random, at_s: float, loops: tuple[str, ...]) -> list[Happening]:
+    """The collector is referenced and started, and stopped soon after, or at once."""
+    who, begins_s = OPERATORS[0], at_s + _REFERENCED_S
+    delay_s = random.expovariate(1 / _BURST_S) if random.random() < _BURST else random.uniform(0, 5)
+    stops = (MoveCollector(action="stop"), Stop(), Stop(loop=random.choice(loops)))
+    return [
+        Order(at_s=at_s, who=who, command=MoveCollector(action="reference")),
+        *([Order(at_s=at_s, who=who, command=Stop())] if random.random() < _BURST else []),
+        Order(at_s=begins_s, who=who, command=MoveCollector(action="start")),
+        Order(at_s=begins_s + delay_s, who=who, command=random.choice(stops)),
+    ]
 
 
 def _stall(random: Random, at_s: float) -> list[Happening]:

@@ -226,6 +226,18 @@ def test_a_loop_may_follow_what_a_frozen_camera_shows(invariants, plant):
     assert follow(invariants, plant, 12, 7.0) == []
 
 
+@pytest.mark.parametrize(
+    ("wrong", "violated"), [("drops", []), ("saturated", ["a tick acts on the newest frame"])]
+)
+def test_a_tick_may_act_on_an_old_frame_where_newer_ones_are_lost(invariants, wrong, violated):
+    line = invariants._lines["camera"]
+    line.wrong[wrong] = 0.0
+    mid_exposure = {"mid_exposure_s": np.nan}
+    invariants.record(tick(1, loop="right", mode="STANDBY", frame_age_s=2.0, **mid_exposure))
+
+    assert [one.invariant for one in invariants.violations] == violated
+
+
 def test_a_loop_may_follow_a_star_that_a_person_pointed_at(invariants, plant):
     invariants.answered(Look(az_px=20.0, el_px=20.0), Reply(accepted=True))
 
