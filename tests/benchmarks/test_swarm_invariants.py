@@ -7,13 +7,14 @@ import pytest
 
 from benchmarks.swarm.devices.hexapod import SwarmHexapod
 from benchmarks.swarm.invariants import Invariants
-from benchmarks.swarm.lines import FAULTS, Line
+from benchmarks.swarm.lines import FAULTS, WRONG, Line
 from benchmarks.swarm.plan import Order, Plan, Strike, devices_of
 from benchmarks.swarm.run import RIGS as FOLDER
 from benchmarks.swarm.run import run_plan
 from benchmarks.swarm.threads import VirtualTime
 from fitctl.config import load_rig
 from fitctl.drivers.interface import Pose
+from fitctl.logging.records import ModeChange
 from fitctl.messages.commands import Jog, MoveCollector, Release, Reply, Standby, Stop
 from fitctl.messages.modes import Mode
 from fitctl.model.plant import Plant
@@ -40,6 +41,7 @@ class Rig:
                 zero_rad=(0.0, 0.0),
                 powered=mode not in {Mode.OFF, Mode.SAFE},
                 watches_nobody=False,
+                fault="",
                 velocity_rad_s=(0.0, 0.0),
                 master_timeout_s=0.5,
                 line=self.lines[f"{name} siderostat"],
@@ -133,6 +135,33 @@ def test_a_pause_of_the_silence_between_two_ticks_counts():
     assert watched.go_on(1.5) == SAFE
 
 
+def test_a_loop_whose_amplifiers_have_tripped_must_be_safe_in_time():
+    watched = Rig()
+    watched.amplifiers["right"].fault = "overcurrent"
+
+    assert watched.go_on(3.0) == []
+    assert watched.go_on(0.3) == SAFE
+
+
+@pytest.mark.parametrize("wrong", WRONG["piezo"])
+def test_a_loop_whose_piezo_amplifier_is_wrong_must_be_safe_in_time(wrong):
+    watched = Rig()
+    watched.lines["right piezo"].wrong[wrong] = 0.0
+    assert watched.go_on(7.0) == []
+    watched.lines["right piezo"].heal(wrong)
+    watched.lines["right piezo"].wrong[wrong] = 0.0
+
+    assert watched.go_on(8.0) == []
+    assert watched.go_on(0.3) == SAFE
+
+
+def test_an_image_that_is_wrong_demands_no_safe():
+    watched = Rig()
+    watched.lines["camera"].wrong["saturated"] = 0.0
+
+    assert watched.go_on(20.0) == []
+
+
 def test_a_slow_line_is_not_silent():
     watched = Rig()
     watched.lines["right D/A"].faults["slow"] = 1000.0
@@ -215,6 +244,40 @@ def test_in_standby_a_servo_may_go_back_to_where_it_was_after_a_fault():
     watched.invariants.velocity("right", (5.0, 0.0))
 
     assert watched.go_on(0.1) == []
+
+
+def test_motors_that_are_stuck_are_commanded_in_standby():
+    watched = Rig(mode=Mode.STANDBY)
+    watched.go_on(10.0)
+    watched.lines["right siderostat"].wrong["stuck"] = 0.0
+    watched.invariants.velocity("right", (5.0, 0.0))
+
+    assert watched.go_on(0.1) == []
+
+
+@pytest.mark.parametrize(
+    ("wrong", "violated"), [("trip", ["an axis that is not stuck is not called so"]), ("stuck", [])]
+)
+def test_an_axis_may_be_called_stuck_only_if_it_is(wrong, violated):
+    watched = Rig()
+    line = watched.lines["right siderostat"]
+    line.wrong[wrong] = 0.0
+    line.heal()
+    change = ModeChange(
+        time_s=0.0,
+        loop="right",
+        source="VERNIER",
+        target="SAFE",
+        target_number=int(Mode.SAFE),
+        trigger="FAULT",
+        reason="expected following error below 1 rad",
+    )
+    watched.invariants.record(change)
+    assert watched.go_on(2.0) == violated
+    watched.invariants.violations.clear()
+    watched.invariants.record(change)
+
+    assert watched.go_on(0.1) == ["an axis that is not stuck is not called so"]
 
 
 # ------------------------------------------------------------ the collector
