@@ -64,7 +64,9 @@ def run_and_shrink(seed: int) -> Run:
     violations = run.result.violations
     if not violations:
         return run
-    return run._replace(shrunk=shrunk_from(run.plan, violations[0], _MOST_TRIALS))
+    first = violations[0]
+    print(f"\n{seed} violates: {first.invariant}; it is being shrunk", file=sys.stderr, flush=True)
+    return run._replace(shrunk=shrunk_from(run.plan, first, _MOST_TRIALS))
 
 
 def met(plan: Plan) -> Iterator[tuple[str, str]]:
@@ -78,60 +80,91 @@ def met(plan: Plan) -> Iterator[tuple[str, str]]:
             yield first, second
 
 
+class Totals:
+    """What the runs of a swarm amount to.
+
+    Attributes
+    ----------
+    simulated_s : float
+    found : list
+        A finding for each run that violated something.
+    """
+
+    def __init__(self) -> None:
+        self.simulated_s = 0.0
+        self.found: list[dict[str, object]] = []
+        self._started_s, self._cpu_s, self._runs = time.monotonic(), 0.0, 0
+        self._kinds: Counter[str] = Counter()
+        self._modes: Counter[str] = Counter()
+        self._pairs: Counter[tuple[str, str]] = Counter()
+
+    def add(self, run: Run) -> None:
+        """Add a run, and print at once what it violated."""
+        plan, result, _ = run
+        self._runs += 1
+        self.simulated_s += result.lasted_s
+        self._cpu_s += result.cpu_s
+        self._kinds.update(happening.kind for happening in plan.happenings)
+        self._modes.update(result.modes)
+        self._pairs.update(met(plan))
+        if result.violations:
+            self.found.append(finding(run))
+            print(f"\n{json.dumps(self.found[-1])}", file=sys.stderr, flush=True)
+
+    def progress(self, hours: float) -> None:
+        """Draw the progress bar."""
+        _progress(self.simulated_s / 3600, hours, len(self.found), self._started_s)
+
+    def as_object(self, seed: int) -> dict[str, object]:
+        """The object that the command prints."""
+        simulated_s, cpu_s, pairs = self.simulated_s, self._cpu_s, self._pairs
+        return {
+            "seed": seed,
+            "runs": self._runs,
+            "simulated_hours": round(simulated_s / 3600, 3),
+            "took_s": round(time.monotonic() - self._started_s, 1),
+            "real_time_factor_per_core": round(simulated_s / cpu_s, 1) if cpu_s else None,
+            "happenings": dict(self._kinds.most_common()),
+            "modes_entered": dict(self._modes.most_common()),
+            "kinds_that_met_within_1_s": len(pairs),
+            "pairs_that_met_within_1_s": {" + ".join(pair): n for pair, n in pairs.most_common()},
+            "violations": self.found,
+        }
+
+
 def swarm(seed: int, hours: float, jobs: int) -> dict[str, object]:
     """Run until so many hours are simulated, a thing was violated in ten runs, or somebody presses Ctrl-C.
 
-    It also ends, with the object as it then is, if a process of the pool dies.
+    Runs that have begun then are finished and counted: one that is being shrunk takes longer than the others,
+    and its violation must not be lost. The swarm also ends if a process of the pool dies.
     """
-    started_s, simulated_s, cpu_s, runs = time.monotonic(), 0.0, 0.0, 0
-    kinds: Counter[str] = Counter()
-    modes: Counter[str] = Counter()
-    pairs: Counter[tuple[str, str]] = Counter()
-    found: list[dict[str, object]] = []
+    totals = Totals()
     seeds = (seed * _RUNS_A_SEED + number for number in count())
     ending = threading.Event()
+    running: dict[Future[Run], int] = {}
     # Its processes inherit the handler, and finish their runs.
     with ended_by_signals(ending.set), ProcessPoolExecutor(jobs) as pool:
-        running: dict[Future[Run], int] = {}
-        while simulated_s < 3600 * hours and len(found) < _SHOWN and not ending.is_set():
-            try:
+        try:
+            while (
+                totals.simulated_s < 3600 * hours
+                and len(totals.found) < _SHOWN
+                and not ending.is_set()
+            ):
                 while len(running) < 2 * jobs:
                     begun = next(seeds)
                     running[pool.submit(run_and_shrink, begun)] = begun
-                done, _ = wait(running, return_when=FIRST_COMPLETED)
-                ended = [future.result() for future in done]
-            except BrokenProcessPool:
-                detail = _DIED + ", ".join(map(str, sorted(running.values())))
-                found.append({"violated": [{"invariant": NO_EXCEPTION, "detail": detail}]})
-                break
-            for future in done:
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    totals.add(future.result())
+                    del running[future]
+                totals.progress(hours)
+            pool.shutdown(cancel_futures=True)
+            for future in [each for each in running if not each.cancelled()]:
+                totals.add(future.result())
                 del running[future]
-            for run in ended:
-                plan, result = run.plan, run.result
-                runs += 1
-                simulated_s += result.lasted_s
-                cpu_s += result.cpu_s
-                kinds.update(happening.kind for happening in plan.happenings)
-                modes.update(result.modes)
-                pairs.update(met(plan))
-                if result.violations:
-                    found.append(finding(run))
-                    print(f"\n{json.dumps(found[-1])}", file=sys.stderr, flush=True)
-            _progress(simulated_s / 3600, hours, len(found), started_s)
-        pool.shutdown(cancel_futures=True)
-    took_s = time.monotonic() - started_s
-    return {
-        "seed": seed,
-        "runs": runs,
-        "simulated_hours": round(simulated_s / 3600, 3),
-        "took_s": round(took_s, 1),
-        "real_time_factor_per_core": round(simulated_s / cpu_s, 1) if cpu_s else None,
-        "happenings": dict(kinds.most_common()),
-        "modes_entered": dict(modes.most_common()),
-        "kinds_that_met_within_1_s": len(pairs),
-        "pairs_that_met_within_1_s": {" + ".join(pair): n for pair, n in pairs.most_common()},
-        "violations": found,
-    }
+        except BrokenProcessPool:
+            detail = _DIED + ", ".join(map(str, sorted(running.values())))
+            totals.found.append({"violated": [{"invariant": NO_EXCEPTION, "detail": detail}]})
+    return totals.as_object(seed)
 
 
 def find(defect: str, seed: int, hours: float, jobs: int) -> dict[str, object]:

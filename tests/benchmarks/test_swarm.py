@@ -133,6 +133,27 @@ def test_an_exception_of_the_run_itself_is_a_violation_of_its_seed(monkeypatch, 
     assert run_seed(7).result.lasted_s == 0.0
 
 
+@pytest.mark.long
+def test_a_swarm_counts_each_run_that_has_begun_and_ends_if_a_process_dies(monkeypatch, capfd):
+    quiet = msgspec.structs.replace(OVERTAKEN, duration_s=0.1, happenings=[])
+
+    def planned(seed):
+        if seed % 1_000_000 == 1:
+            fails()
+        return msgspec.structs.replace(quiet, seed=seed)
+
+    monkeypatch.setattr(swarm_main, "plan_of", planned)  # inherited by the processes
+    found = swarm_main.swarm(5, hours=1e-9, jobs=1)
+
+    assert found["runs"] == 2
+    assert [violation["seed"] for violation in found["violations"]] == [5_000_001]
+    assert "5000001 violates: no exception escapes" in capfd.readouterr().err
+
+    monkeypatch.setattr(swarm_main, "plan_of", lambda _seed: os._exit(1))
+    (violation,) = swarm_main.swarm(5, hours=1.0, jobs=1)["violations"]
+    assert "5000000" in violation["violated"][0]["detail"]
+
+
 def test_what_is_called_at_a_time_and_fails_reaches_no_thread(time):
     seen = []
 
