@@ -55,6 +55,10 @@ _LOCAL_S = (1e-5, 1e-3)
 _REMOTE_S = (1e-3, 0.3)
 _GARBAGE = 0.02  # of the messages
 _MOST_GARBAGE_BYTES = 200
+_FLOOD, _FLOOD_S = (
+    20,
+    2.0,
+)  # so many refusals within that time may be followed by some without an answer
 
 
 class _Frame(NamedTuple):
@@ -228,6 +232,7 @@ class SwarmService(Service):
         self._decode = msgspec.msgpack.Decoder(Reply).decode
         self._sent: dict[bytes, tuple[Sender, AnyCommand | None, Callable[[Reply], None]]] = {}
         self._arrives_s: dict[str, float] = {}  # by sender: no message overtakes another
+        self._refused_s: dict[str, deque[float]] = {}  # by sender: when, of the newest
         self._ended = VirtualEvent(time)
         time.spawn(self.run, "service")
 
@@ -295,6 +300,21 @@ class SwarmService(Service):
             detail = f"{sender} sent it, and it counts as sent by {waiting.sender}"
             self._invariants.violated("a command is its sender's", detail)
         super()._receive(waiting, payload)
+
+    def _refuse(self, waiting: Waiting, reply: Reply, now_s: float) -> None:
+        """A sender elsewhere that is refused too often is not answered each time; the others are counted."""
+        sender, _, answered = self._sent[waiting.tag]
+        refused_s = self._refused_s.setdefault(sender.name, deque(maxlen=_FLOOD))
+        refused_s.append(now_s)
+        before = self._withheld(sender)
+        super()._refuse(waiting, reply, now_s)
+        is_flood = len(refused_s) == _FLOOD and now_s - refused_s[0] < _FLOOD_S
+        if self._withheld(sender) > before and is_flood:
+            answered(reply)
+
+    def _withheld(self, sender: Sender) -> int:
+        """How many of its refusals are counted, and not yet reported."""
+        return self._intake._dropped[sender.name, "refused without an answer"]
 
     def _done(self, waiting: Waiting, stopped: str | None, reply: Reply) -> None:
         _, command, _ = self._sent[waiting.tag]

@@ -35,6 +35,9 @@ PLAN = Plan(
 )
 
 
+WITHHELD = "refused without an answer"
+
+
 def violated():
     return {one.invariant for one in run_plan(PLAN).violations}
 
@@ -115,6 +118,35 @@ def test_garbage_that_is_taken_for_a_command_is_found(monkeypatch):
     monkeypatch.setattr(intake, "decode_command", obliging)
 
     assert "what is no command is refused" in violated()
+
+
+FLOOD = msgspec.structs.replace(
+    PLAN,
+    duration_s=4.0,
+    happenings=[
+        Order(at_s=0.1, who="ada", command=Standby()),
+        *[Order(at_s=1.0 + 0.01 * number, who="ben", command=Standby()) for number in range(40)],
+    ],
+)
+
+
+@pytest.mark.long
+def test_of_a_flood_of_refusals_some_are_counted_in_place_of_an_answer(monkeypatch):
+    told = []
+
+    def on_record(record):
+        if isinstance(record, Event):
+            told.append(record.message)
+
+    assert run_plan(FLOOD, on_record).violations == []
+    assert any("refused without an answer" in text for text in told)
+
+    never = FLOOD.happenings[:5]  # no flood
+    monkeypatch.setattr(
+        intake.Intake, "answers_refusal", lambda self, name, _: bool(self.drop(name, WITHHELD))
+    )
+    few = run_plan(msgspec.structs.replace(FLOOD, duration_s=8.0, happenings=never))
+    assert "a command is answered once" in {one.invariant for one in few.violations}
 
 
 @pytest.mark.long
