@@ -151,6 +151,9 @@ bench-learn-online: $(READY)  ## Measure loops that learn while they observe (ha
 bench-margins: $(READY)  ## Compute the least residual that the margins allow, beside the learner's design (two minutes)
 	$(BIN)/python -m benchmarks.least_with_margins $(ARGS)
 
+bench-sensor: $(READY)  ## Measure the time that the fit of a spot takes, beside the centroid
+	$(BIN)/python -m benchmarks.sensor $(ARGS)
+
 bench-testbed: $(READY)  ## Measure the testbed while its collector moves, and compare with its goals (ten minutes)
 	$(BIN)/python -m benchmarks.testbed $(ARGS)
 

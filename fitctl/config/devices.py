@@ -99,6 +99,11 @@ class Camera(Settings):
         return 1.0 / self.frame_rate_hz
 
     @property
+    def full_scale_dn(self) -> int:
+        """To so many a pixel counts; one that reads this has more light than it can say."""
+        return FULL_SCALE_DN[self.device.pixel_format]
+
+    @property
     def largest_window_px(self) -> tuple[int, int]:
         """The last pixel, az and el, about which the window fits; the first is `HALF_WINDOW_PX`."""
         return self.width_px - 1 - HALF_WINDOW_PX, self.height_px - 1 - HALF_WINDOW_PX

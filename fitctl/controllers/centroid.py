@@ -202,8 +202,9 @@ class StarSensor:
         if self.fit is None:
             sigma_px = self._centroid_sigma_px
             return Star(az + az_px, el + el_px, flux_dn, az, el, sigma_px, sigma_px)
-        good = self._dark.good(image, el - HALF_WINDOW_PX, az - HALF_WINDOW_PX, side, side)
-        place = self.fit.place(light_dn, az_px, el_px, good)
+        top, left = el - HALF_WINDOW_PX, az - HALF_WINDOW_PX
+        without = self._dark.without_measurement(image, top, left, side, side)
+        place = self.fit.place(light_dn, az_px, el_px, without)
         if place is None:
             return None
         az_px, el_px, _, az_sigma_px, el_sigma_px = place

@@ -14,7 +14,6 @@ from fitctl.files import read_regular
 Floats = NDArray[np.float64]
 _MOST_BYTES = 64 << 20
 _MOST_BAD = 0.1  # of the pixels
-FULL_WELL_DN = 65535  # a pixel that reads this has more light than it can say
 _MEASURE = "measure it again: fitctl sequence run dark"
 
 
@@ -33,6 +32,7 @@ class Dark:
 
     def __init__(self, camera: Camera) -> None:
         shape = (camera.height_px, camera.width_px)
+        self._full_dn = camera.full_scale_dn
         if camera.dark_file is None:
             self._dark_dn = np.full(shape, float(camera.bias_dn))
         else:
@@ -57,26 +57,20 @@ class Dark:
                 light_dn[row - top, column - left] = near_dn.mean()
         return light_dn
 
-    def good(
+    def without_measurement(
         self, image: NDArray[np.uint16], top: int, left: int, height: int, width: int
-    ) -> NDArray[np.bool_] | None:
-        """Which pixels of a part are measurements, shape (height, width); None where all are.
-
-        Neither bad pixels nor saturated ones are.
-        """
-        part_dn = image[top : top + height, left : left + width]
-        is_full = part_dn.item(part_dn.argmax()) >= FULL_WELL_DN
-        bad = [
-            (row - top, column - left)
+    ) -> tuple[int, ...]:
+        """Pixels of a part that are bad or saturated, counted row by row."""
+        numbers = [
+            (row - top) * width + column - left
             for row, column, *_ in self._bad
             if top <= row < top + height and left <= column < left + width
         ]
-        if not (is_full or bad):
-            return None
-        good = part_dn < FULL_WELL_DN
-        for place in bad:
-            good[place] = False
-        return good
+        part_dn = image[top : top + height, left : left + width].ravel()
+        if part_dn.item(part_dn.argmax()) >= self._full_dn:
+            full = np.flatnonzero(part_dn >= self._full_dn).tolist()
+            numbers = sorted({*numbers, *full})
+        return tuple(numbers)
 
 
 def read_dark(path: Path, shape: tuple[int, int]) -> Floats:

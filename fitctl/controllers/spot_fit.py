@@ -33,22 +33,34 @@ PLACES = 2 * NODES + 1  # along an axis
 _SIDE = 2 * HALF_WINDOW_PX + 1
 _EDGES_PX = np.arange(_SIDE + 1) - _SIDE / 2
 _SLOPE_STEP_PX = 1e-3
-# A pixel is left out if it misses the fit by so many standard deviations, and no more than such a part of the
-# misfit is the others', or no more than theirs should be by so many times: a spot that is wider than told
-# misses at several pixels alike.
+# A pixel is left out if it misses the fit by so many standard deviations.
 _INEXACT_PART = 1e-3  # of the flux: so far off may a pixel of a bright spot be between two nodes
-_OUTLIER_SIGMAS, _OTHERS_PART, _OTHERS_TIMES = 6.0, 0.2, 2.0
+_OUTLIER_SIGMAS = 6.0
+# One, two or three are, if no more than such a part of the misfit is the others', or no more than theirs should
+# be by so many times. A spot that is wider than told misses at several pixels alike: without the worst one, two
+# or three of a spot that is 13 % narrower, 0.19, 0.14 and 0.09 of its misfit stay at least.
+_OTHERS_PARTS, _OTHERS_TIMES = (0.2, 0.1, 0.05), 2.0
+_REMEMBERED = 1000  # weights, of 1.6 kB
+_AMOUNTS = 4  # flux, two moments, background
 
 
 class _Solution(NamedTuple):
-    """Where the pixels put the spot: `fit_dn` is what each should read, by weights made for a node."""
+    """Where the pixels put the spot, by weights made for a node.
+
+    Attributes
+    ----------
+    amounts : array, shape (4,)
+    left_dn : array, shape (49,)
+        What is left of the pixels; 0 of those that are left out.
+    """
 
     az_px: float
     el_px: float
     flux_dn: float
     weights: Floats
     node: tuple[int, int]
-    fit_dn: Floats
+    amounts: Floats
+    left_dn: Floats
 
 
 class SpotPlace(NamedTuple):
@@ -61,7 +73,7 @@ class SpotPlace(NamedTuple):
     flux_dn : float
         All its light.
     az_sigma_px, el_sigma_px : float
-        One standard deviation, from pixel noise and photons.
+        One standard deviation, from pixel noise and photons, both as large as the pixels' misfit says.
     """
 
     az_px: float
@@ -143,13 +155,16 @@ class SpotFit:
         self._deviation_dn = np.sqrt(self._variance_dn2(flux_dn * self._terms[..., 0]))
         self.weights = _make_weights(self._terms, self._deviation_dn)
         leverage = np.einsum("rcpt,rctp->rcp", self._terms, self.weights)
-        self._leverage_scale = 1 / np.sqrt(1 - leverage)
+        # What the fit would miss without a pixel (Cook and Weisberg, Residuals and Influence, 1982).
+        self._missed_per_dn = 1 / (self._deviation_dn * np.sqrt(1 - leverage))
+        # Bad pixels stay where they are, and a star that is held lies at a few nodes.
+        self._weights_without = functools.lru_cache(_REMEMBERED)(self._leave_out)
 
     def _variance_dn2(self, light_dn: Floats) -> Floats:
         return self._noise_dn**2 + self._photon_dn * np.maximum(light_dn, 0.0)
 
     def place(
-        self, light_dn: Floats, az_px: float, el_px: float, good: NDArray[np.bool_] | None = None
+        self, light_dn: Floats, az_px: float, el_px: float, without: tuple[int, ...] = ()
     ) -> SpotPlace | None:
         """Where the spot is that lies near a place; None if there is none within the window's reach.
 
@@ -159,37 +174,36 @@ class SpotFit:
             Dark subtracted.
         az_px, el_px : float
             Where it was found to be, from the window's centre.
-        good : array of bool, shape (7, 7), optional
-            Pixels that count; all without it.
+        without : tuple of int, optional
+            Pixels that do not count, row by row. A few more that miss the fit by far are left out.
         """
         pixels_dn = light_dn.ravel()
-        counts = None if good is None else good.ravel()
-        found = self._converge(pixels_dn, az_px, el_px, counts)
-        if counts is None and found is not None:
-            outlier = self._outlier(pixels_dn, found)
-            if outlier is not None:
-                counts = np.ones(pixels_dn.size, dtype=bool)
-                counts[outlier] = False
-                found = self._converge(pixels_dn, az_px, el_px, counts)
+        found = self._converge(pixels_dn, az_px, el_px, without)
         if found is None:
             return None
-        variance_dn2 = self._variance_dn2(found.fit_dn)
-        variances = np.square(found.weights[1:3]).dot(variance_dn2)
-        sigmas_px = (np.sqrt(variances) / found.flux_dn).tolist()
-        return SpotPlace(found.az_px, found.el_px, found.flux_dn, *sigmas_px)
+        if (worst := self._outlier(found)) is not None:
+            found, without = self._without_outliers(pixels_dn, found, without, worst)
+        left_dn, az_weights, el_weights = found.left_dn, found.weights[1], found.weights[2]
+        if self._photon_dn:  # in parts of each pixel's noise
+            noise_dn = np.sqrt(self._variance_dn2(self._terms[found.node].dot(found.amounts)))
+            left_dn = left_dn / noise_dn
+            az_weights, el_weights = az_weights * noise_dn, el_weights * noise_dn
+        freedom = pixels_dn.size - len(without) - _AMOUNTS
+        scale = math.sqrt(left_dn.dot(left_dn) / freedom) / found.flux_dn
+        az_sigma_px = scale * math.sqrt(az_weights.dot(az_weights))
+        el_sigma_px = scale * math.sqrt(el_weights.dot(el_weights))
+        return SpotPlace(found.az_px, found.el_px, found.flux_dn, az_sigma_px, el_sigma_px)
 
     def _converge(
-        self, pixels_dn: Floats, az_px: float, el_px: float, counts: NDArray[np.bool_] | None
+        self, pixels_dn: Floats, az_px: float, el_px: float, without: tuple[int, ...]
     ) -> _Solution | None:
         """Two steps from a place; the first may begin half a pixel off, the second ends at the spot."""
+        at = -1, -1
         for _ in range(2):
-            at = node(el_px), node(az_px)
-            weights = self.weights[at]
-            if counts is not None:
-                weights = np.zeros(weights.shape)
-                weights[:, counts] = _make_weights(
-                    self._terms[at][counts], self._deviation_dn[at][counts]
-                )
+            before, at = at, (node(el_px), node(az_px))
+            if at == before:
+                break  # with the same weights it would end at the same place
+            weights = self._weights_without(at, without) if without else self.weights[at]
             amounts = weights.dot(pixels_dn)
             flux_dn, az_moment, el_moment, _ = amounts.tolist()
             if flux_dn <= 0:
@@ -198,22 +212,51 @@ class SpotFit:
             el_px = (at[0] - NODES) / STEPS_PER_PX + el_moment / flux_dn
         if max(abs(az_px), abs(el_px)) > HALF_WINDOW_PX:
             return None
-        fit_dn = self._terms[at].dot(amounts)
-        return _Solution(az_px, el_px, flux_dn, weights, at, fit_dn)
+        left_dn = pixels_dn - self._terms[at].dot(amounts)
+        for pixel in without:
+            left_dn[pixel] = 0.0
+        return _Solution(az_px, el_px, flux_dn, weights, at, amounts, left_dn)
 
-    def _outlier(self, pixels_dn: Floats, found: _Solution) -> int | None:
-        """The pixel without which the fit is right; None if it is right, or wrong for another reason."""
-        deviations = (pixels_dn - found.fit_dn) / self._deviation_dn[found.node]
-        # What the fit would miss without a pixel (Cook and Weisberg, Residuals and Influence, 1982).
-        missed = deviations * self._leverage_scale[found.node]
-        worst = int(np.abs(missed).argmax())
-        worst_2 = missed.item(worst) ** 2
-        expected_2 = 1 + (_INEXACT_PART * found.flux_dn / self._noise_dn) ** 2
-        if worst_2 <= _OUTLIER_SIGMAS**2 * expected_2:
-            return None
-        misfit = float(deviations.dot(deviations))
-        limit = max(_OTHERS_PART * misfit, _OTHERS_TIMES * expected_2 * deviations.size)
-        return worst if misfit - worst_2 <= limit else None
+    def _outlier(self, found: _Solution) -> int | None:
+        """The pixel that misses the fit by most standard deviations, if by too many."""
+        missed = np.abs(found.left_dn * self._missed_per_dn[found.node])
+        worst = int(missed.argmax())
+        limit_2 = _OUTLIER_SIGMAS**2 * self._expected_2(found)
+        return worst if missed.item(worst) ** 2 > limit_2 else None
+
+    def _without_outliers(
+        self, pixels_dn: Floats, found: _Solution, without: tuple[int, ...], worst: int | None
+    ) -> tuple[_Solution, tuple[int, ...]]:
+        """Without the few pixels that spoil a fit; as it was if they are not few, or not outliers."""
+        left_out, fewer = without, found
+        expected = _OTHERS_TIMES * pixels_dn.size * self._expected_2(found)
+        for _ in _OTHERS_PARTS:
+            if worst is None:
+                break
+            part = _OTHERS_PARTS[len(left_out) - len(without)]
+            left_out = (*left_out, worst)
+            tried = self._converge(pixels_dn, fewer.az_px, fewer.el_px, left_out)
+            if tried is None:
+                break
+            if self._misfit(tried) <= max(part * self._misfit(found), expected):
+                found, without = tried, left_out
+            fewer, worst = tried, self._outlier(tried)
+        return found, without
+
+    def _misfit(self, found: _Solution) -> float:
+        deviations = found.left_dn / self._deviation_dn[found.node]
+        return float(deviations.dot(deviations))
+
+    def _expected_2(self, found: _Solution) -> float:
+        """What a pixel may miss: its noise, and the steps between nodes; in variances."""
+        return 1 + (_INEXACT_PART * found.flux_dn / self._noise_dn) ** 2
+
+    def _leave_out(self, at: tuple[int, int], without: tuple[int, ...]) -> Floats:
+        """A node's weights without some pixels, shape (4, 49): as if each of them read what the fit says."""
+        weights, pixels = self.weights[at], list(without)
+        seen = -self._terms[at][pixels].dot(weights)
+        seen[range(len(pixels)), pixels] += 1.0
+        return np.asarray(weights - weights[:, pixels].dot(np.linalg.solve(seen[:, pixels], seen)))
 
     def noise_px(self, flux_dn: float) -> float:
         """One standard deviation of a spot's place along an axis, on the mean of places within a pixel."""

@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fitctl.config import HALF_WINDOW_PX
+from fitctl.config import HALF_WINDOW_PX, AxisPair, Spot, default_rig_path, load_rig
 from fitctl.controllers.centroid import StarSensor
 from fitctl.model.image.scene import Scene
 
@@ -128,3 +128,52 @@ def test_a_spot_cut_by_the_frames_edge_is_not_accepted(sensor, expose, beyond, a
         "top": (along, 39.0 - beyond),
     }[edge]
     assert sensor.find(expose(place)) is None
+
+
+# ---------------------------------------------------------------- the fit on whole frames
+
+
+def fitted(*settings):
+    rig = load_rig(default_rig_path(), ["loops.right.sensor=fit", *settings])
+    return rig, StarSensor(rig.camera, rig.loops["right"])
+
+
+@given(
+    away=st.floats(2.0, 3.0),
+    along=st.floats(2.0, 37.0),
+    edge=st.sampled_from(["left", "right", "bottom", "top"]),
+)
+def test_near_an_edge_of_the_frame_the_fit_is_as_good(expose, away, along, edge):
+    _, sensor = fitted()
+    place = {
+        "left": (away, along),
+        "right": (39.0 - away, along),
+        "bottom": (along, away),
+        "top": (along, 39.0 - away),
+    }[edge]
+    star = sensor.in_window(expose(place), *place)
+    assert (star.az_px, star.el_px) == pytest.approx(place, abs=6 * 0.0024)
+
+
+@pytest.mark.parametrize(("pixel_format", "full_dn"), [("Mono12", 4095), ("Mono16", 65535)])
+def test_a_saturated_pixel_is_no_measurement_of_the_fit(pixel_format, full_dn):
+    """Of a star that is brighter than its rig file has it; the noise is small, so that it shows."""
+    rig, sensor = fitted(
+        f"camera.device.pixel_format={pixel_format}",
+        "camera.pixel_noise_dn=2.0",
+        f"loops.right.star_flux_dn={3.9 * (full_dn - 1000)}",
+        "loops.right.other_spots=[]",
+        "loops.right.flux_range={low=0.75,high=1.4}",
+    )
+    spot = Spot(
+        name="star",
+        offset_px=AxisPair(az=0.0, el=0.0),
+        flux_dn=4.3 * (full_dn - 1000),
+        diameter_px=3.0,
+    )
+    scene, errors_px = Scene(rig.camera, [spot]), []
+    for number, place in enumerate(np.random.default_rng(1).uniform(19.8, 20.2, (40, 2))):
+        image = scene.frame(np.array([place]), 1, number)
+        assert image.max() == full_dn
+        errors_px.append(sensor.in_window(image, *place).position_px - place)
+    assert np.std(errors_px) < 1e-3

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fitctl.config import Spot
+from fitctl.config import Spot, default_rig_path, load_rig
 from fitctl.config.base import AxisPair
 from fitctl.controllers.centroid import OtherLight, StarSensor
 from fitctl.model.image.scene import Scene
@@ -40,6 +40,16 @@ def test_the_light_of_another_loops_spot_does_not_pull_a_star(rig, sensor, other
     # Six times the noise.
     assert star.position_px == pytest.approx(STAR, abs=0.06)
     assert star.flux_dn == pytest.approx(28_000, abs=6 * 7 * 20)
+
+
+@pytest.mark.parametrize("other_px", [(25.0, 20.0), (24.3, 20.3)])
+def test_nor_does_it_pull_a_star_that_is_fitted(rig, other_px):
+    fitted = load_rig(default_rig_path(), ["loops.right.sensor=fit"])
+    sensor = StarSensor(fitted.camera, fitted.loops["right"])
+    sensor.other_light = [OtherLight(*other_px, 4_000.0, 3.0)]
+    star = sensor.measure(frame(rig, other_px, 4_000.0), *STAR)
+
+    assert star.position_px == pytest.approx(STAR, abs=6 * 0.0024)
 
 
 def test_a_spot_that_is_not_near_changes_nothing(rig, sensor):

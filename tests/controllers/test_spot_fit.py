@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fitctl.controllers.spot_fit import SpotFit, gaussian_shape
+from fitctl.controllers.spot_fit import NODES, SpotFit, gaussian_shape
 
 DIAMETER_PX, NOISE_DN, FLUX_DN = 3.0, 20.0, 28_000.0  # FIT's star
 FIT = SpotFit(DIAMETER_PX, NOISE_DN, FLUX_DN)
@@ -46,9 +46,9 @@ def errors(fit, *, photon_dn=0.0, spoil=None, seed=1, **spot):
         if photon_dn:
             window = photon_dn * drawn.poisson(window / photon_dn)
         window = window + NOISE_DN * drawn.standard_normal((7, 7))
-        good = spoil(window, drawn) if spoil else None
+        without = spoil(window, drawn) if spoil else ()
         start = 0.01 * drawn.standard_normal(2)
-        place = fit.place(window, az_px + start[0], el_px + start[1], good)
+        place = fit.place(window, az_px + start[0], el_px + start[1], without)
         found.append(place.az_px - az_px)
         stated.append(place.az_sigma_px)
     return np.array(found), np.array(stated)
@@ -81,11 +81,9 @@ def test_a_spot_that_is_13_percent_wider_than_told_is_found_within_0_006_px():
 
 def hot(dn, *, known):
     def spoil(window, drawn):
-        place = tuple(drawn.integers(0, 7, 2))
-        window[place] += dn
-        good = np.ones((7, 7), dtype=bool)
-        good[place] = False
-        return good if known else None
+        row, column = drawn.integers(0, 7, 2)
+        window[row, column] += dn
+        return (7 * row + column,) if known else ()
 
     return spoil
 
@@ -99,6 +97,56 @@ def test_a_hot_or_dead_pixel_is_left_out(dn, known):
     assert found.std() <= 1.1 * FIT.noise_px(FLUX_DN)
 
 
+def several_hot(*dns):
+    def spoil(window, drawn):
+        for dn in dns:
+            window[tuple(drawn.integers(0, 7, 2))] += dn
+        return ()
+
+    return spoil
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("dns", [(3000.0, 3000.0), (3000.0, 400.0), (-800.0, 3000.0)])
+def test_two_hot_or_dead_pixels_are_left_out(dns):
+    found, _ = errors(FIT, spoil=several_hot(*dns))
+    assert found.std() <= 1.1 * FIT.noise_px(FLUX_DN)
+
+
+@pytest.mark.long
+def test_a_hot_pixel_is_left_out_of_a_spot_that_is_wider_than_told_too():
+    found, _ = errors(FIT, spoil=several_hot(3000.0), diameter_px=1.13 * DIAMETER_PX)
+    assert found.std() <= 0.01
+
+
+@pytest.mark.parametrize("without", [(24,), (17, 3), (0, 24, 25, 48)])
+def test_pixels_that_are_left_out_have_no_part_in_it(without):
+    """Least squares over the others alone has the same weights."""
+    at = NODES + 3, NODES - 2
+    others = np.setdiff1d(np.arange(49), without)
+    shape = FIT._terms[at][others] / NOISE_DN
+    weights = FIT._leave_out(at, without)
+    assert weights[:, others] == pytest.approx(np.linalg.pinv(shape) / NOISE_DN, abs=1e-9)
+    assert np.abs(weights[:, without]).max() < 1e-12
+
+
+@pytest.mark.parametrize("noise_dn", [NOISE_DN, 3 * NOISE_DN])
+def test_how_sure_it_is_follows_from_the_pixels_and_not_from_what_it_was_told(noise_dn):
+    louder = math.sqrt(noise_dn**2 - NOISE_DN**2)
+
+    def more_noise(window, drawn):
+        window += louder * drawn.standard_normal((7, 7))
+        return ()
+
+    found, stated = errors(FIT, spoil=more_noise)
+    assert stated.mean() == pytest.approx(found.std(), rel=0.06)
+
+
+def test_of_a_spot_that_is_wider_than_told_it_is_less_sure_than_it_could_be():
+    found, stated = errors(FIT, diameter_px=1.13 * DIAMETER_PX)
+    assert stated.mean() > found.std()
+
+
 def test_saturated_pixels_that_are_known_do_not_matter():
     bright = 40 * FLUX_DN
 
@@ -106,7 +154,7 @@ def test_saturated_pixels_that_are_known_do_not_matter():
         full = window >= 65535
         assert 2 <= full.sum() <= 12
         window[full] = 65535
-        return ~full
+        return tuple(np.flatnonzero(full))
 
     found, _ = errors(FIT, spoil=saturate, flux_dn=bright)
     assert found.std() < FIT.noise_px(FLUX_DN) / 3

@@ -67,7 +67,7 @@ def _link(rig: Rig) -> Iterator[Conflict]:
 
 def _bias(rig: Rig) -> Iterator[Conflict]:
     pixel_format, bias_dn = rig.camera.device.pixel_format, rig.camera.bias_dn
-    full_dn = FULL_SCALE_DN[pixel_format]
+    full_dn = rig.camera.full_scale_dn
     if bias_dn >= full_dn:
         yield Conflict(
             f"a pixel of {pixel_format} counts to {full_dn}",
@@ -97,7 +97,7 @@ def _star(rig: Rig, name: str, loop: Loop) -> Iterator[Conflict]:
     camera = rig.camera
     key = f"loops.{name}"
     pixel_format = camera.device.pixel_format
-    full_dn = FULL_SCALE_DN[pixel_format]
+    full_dn = camera.full_scale_dn
     part = loop.brightest_part
     brightest_dn = part * loop.star_flux_dn
     if camera.bias_dn < full_dn < camera.bias_dn + brightest_dn:

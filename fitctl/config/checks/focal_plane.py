@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator
 
 from fitctl.config.conflict import Conflict, Part, above, at_least, at_most
-from fitctl.config.devices import FULL_SCALE_DN, HALF_WINDOW_PX
+from fitctl.config.devices import HALF_WINDOW_PX
 from fitctl.config.loops import Loop
 from fitctl.config.rig import Rig
 
@@ -71,7 +71,7 @@ def _overlapping_spots(rig: Rig) -> Iterator[Conflict]:
         for name, loop in rig.stellar_loops.items()
         for spot in loop.other_spots
     ]
-    full_dn = FULL_SCALE_DN[rig.camera.device.pixel_format] - rig.camera.bias_dn
+    full_dn = rig.camera.full_scale_dn - rig.camera.bias_dn
     for (one, first, az, el), (other, second, az2, el2) in itertools.combinations(spots, 2):
         if one == other or max(abs(az - az2), abs(el - el2)) > HALF_WINDOW_PX:
             continue

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import LEAST_OVERLAP, MOST_OVERLAP, AxisPair, Rig
-from fitctl.config.devices import FULL_SCALE_DN
 from fitctl.controllers.centroid import LARGEST_PEAK, Star
 from fitctl.controllers.spiral import SpiralPlan, plan_spiral
 from fitctl.loop.search.attribution import Attribution
@@ -185,13 +184,11 @@ def _too_faint_or_bright(rig: Rig, loop_name: str, star_flux_dn: float | None) -
     if not 0 < star_flux_dn < math.inf:
         return f"star_flux_dn must be above 0 (is {star_flux_dn:g})"
     loop, camera = rig.stellar_loops[loop_name], rig.camera
-    pixel_format = camera.device.pixel_format
-    full_dn = FULL_SCALE_DN[pixel_format]
-    most_dn = (full_dn - camera.bias_dn) / loop.brightest_part
+    most_dn = (camera.full_scale_dn - camera.bias_dn) / loop.brightest_part
     if star_flux_dn > most_dn:
         return (
-            f"a star of {star_flux_dn:g} DN would saturate its brightest pixel, which counts to {full_dn} as "
-            f"{pixel_format}; at most {most_dn:.0f} DN can be measured; dim it, or expose for less time"
+            f"a star of {star_flux_dn:g} DN would saturate its brightest pixel, which counts to "
+            f"{camera.full_scale_dn}; at most {most_dn:.0f} DN can be measured; dim it, or expose for less time"
         )
     least_dn = loop.acquisition.detection_sigma * camera.pixel_noise_dn / LARGEST_PEAK
     if star_flux_dn < least_dn:

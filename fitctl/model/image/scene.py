@@ -15,7 +15,6 @@ from fitctl.model.image.light import light_below, light_fractions, light_table
 from fitctl.model.image.pixel_noise import GOLDEN, QUANTILE_SHIFT, mix, pixel_normals, quantiles
 
 Floats = NDArray[np.float64]
-FULL_WELL_DN = 65535
 
 
 class Scene:
@@ -43,6 +42,7 @@ class Scene:
         self._bias_dn = camera.bias_dn
         self._noise_dn = camera.pixel_noise_dn
         self._photon_dn = photon_dn(camera)
+        self._full_dn = camera.full_scale_dn
         self._flux_dn = np.array([spot.flux_dn / instants for spot in spots] * instants)
         # The 1/e^2 diameter of a Gaussian is four standard deviations.
         self._sigma_px = np.array([spot.diameter_px / 4 for spot in spots] * instants)
@@ -80,7 +80,7 @@ class Scene:
             self._bias_dn,
             self._noise_dn if noise_dn is None else noise_dn,
             self._photon_dn,
-            FULL_WELL_DN,
+            self._full_dn,
             np.uint64(key),
             number,
             quantiles(),
@@ -99,11 +99,11 @@ class Scene:
         dark_dn = self._noise_dn if noise_dn is None else noise_dn
         noise_dn2 = dark_dn**2 + self._photon_dn * (expected_dn - self._bias_dn)
         noisy = expected_dn + np.sqrt(noise_dn2) * noise
-        return self._with_hot_pixels(np.clip(np.rint(noisy), 0, FULL_WELL_DN))
+        return self._with_hot_pixels(np.clip(np.rint(noisy), 0, self._full_dn))
 
     def _with_hot_pixels(self, read_dn: Floats) -> NDArray[np.uint16]:
         for row, column, dn in self._hot:
-            read_dn[row, column] = min(round(read_dn[row, column] + dn), FULL_WELL_DN)
+            read_dn[row, column] = min(round(read_dn[row, column] + dn), self._full_dn)
         return read_dn.astype(np.uint16)
 
     def _pixel_fractions(self, edges: Floats, centre_px: Floats) -> Floats:

@@ -29,7 +29,7 @@ from fitctl.loop.sky import sky_rad_s
 from fitctl.model.compiled import record
 from fitctl.model.image.light import light_table
 from fitctl.model.image.pixel_noise import quantiles
-from fitctl.model.image.scene import FULL_WELL_DN, photon_dn
+from fitctl.model.image.scene import photon_dn
 from fitctl.model.lines import FIELDS as LINE_FIELDS
 from fitctl.model.metrology.part import BeamConstants
 from fitctl.model.optics import motor_sky_rad_per_rad, scales, sky_px_per_rad
@@ -117,7 +117,7 @@ def star_settings(
             "period_s": camera.period_s,
             "bias_dn": camera.bias_dn,
             "photon_dn": photon_dn(camera),
-            "full_dn": float(FULL_WELL_DN),
+            "full_dn": float(camera.full_scale_dn),
             "quantiles": quantiles(),
             "light": light_table(),
             "first_spot": first_spot,

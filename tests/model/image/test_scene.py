@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from fitctl.controllers.centroid import StarSensor
 from fitctl.model.compiled import numba_installed
 from fitctl.model.image.light import centroid_noise_px
-from fitctl.model.image.scene import FULL_WELL_DN, Scene
+from fitctl.model.image.scene import Scene
 
 within = st.floats(6.0, 33.0)  # a spot's light is all on the frame
 
@@ -81,7 +81,7 @@ def test_a_glaring_star_saturates_and_does_not_wrap(rig, spots):
     glare = spots[0].model_copy(update={"flux_dn": 1e7})
     image = Scene(rig.camera, [glare]).frame(np.array([[20.0, 20.0]]), 0, 0)
     assert image.dtype == np.uint16
-    assert image[20, 20] == FULL_WELL_DN
+    assert image[20, 20] == rig.camera.full_scale_dn
     assert np.all(image[18:23, 20] > 10_000)
 
 
