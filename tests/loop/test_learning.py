@@ -8,12 +8,12 @@ import pytest
 from samples.learner_reports import PAPER, SHAKEN, report
 
 from fitctl.config import default_rig_path, load_rig
-from fitctl.controllers.design.basis import Line
+from fitctl.controllers.design.basis import Line, basis
 from fitctl.controllers.design.document import parameters_json
 from fitctl.controllers.design.margins import design_with_margins
 from fitctl.controllers.design.minimum_variance import design_minimum_variance
 from fitctl.logging.records import ControllerChange, Event
-from fitctl.loop.learning import CALM_S, PAUSE_S
+from fitctl.loop.learning import CALM_S, PAUSE_S, Learning
 from fitctl.messages.commands import (
     Acquire,
     LearnerReport,
@@ -253,6 +253,52 @@ def test_while_the_target_moves_nothing_changes(shaken):
     shaken.simulation.run(15.0 + CALM_S)
     shaken.report()
     assert len(shaken.changes()) == 1
+
+
+@pytest.mark.parametrize(
+    "hindrance",
+    [
+        {"saturated": True},
+        {"error_px": None},  # no star
+        {"target_px": (20.2, 20.0)},
+        {"hindered": True},  # not in VERNIER, an experiment, or an interlock
+        {"now_s": CALM_S + 1.0},  # after a gap
+    ],
+)
+def test_nothing_changes_until_the_loop_has_been_calm_for_a_while(hindrance):
+    learning = Learning(load_rig(default_rig_path(), ["loops.right.learn=on"]), "right")
+    learning.accept(report())
+    still = (np.zeros(2), np.zeros(2))
+
+    def observe(now_s, **values):
+        frame = {"error_px": (0.0, 0.0), "target_px": (20.0, 20.0), "stages_rad": still}
+        learning.observe(**frame | {"now_s": now_s, "saturated": False, "hindered": False} | values)
+        return learning.wants_change(now_s)
+
+    calm = [observe(0.02 * n) for n in range(round(CALM_S / 0.02) + 10)]
+    begins_s = 0.02 * len(calm)
+    observe(**{"now_s": begins_s} | hindrance)
+    later_s = hindrance.get("now_s", begins_s) + 0.02
+    again = [observe(later_s + 0.02 * n) for n in range(round(CALM_S / 0.02) + 10)]
+
+    for wanted in (calm, again):
+        assert not any(wanted[: round(CALM_S / 0.02) - 1])
+        assert wanted[-1]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("sensor", ["centroid", "fit"])
+def test_on_a_quiet_night_the_change_is_without_a_bump_too(sensor):
+    night = Night(f"loops.right.sensor={sensor}", "loops.right.vernier.controller=minimum-variance")
+    night.simulation.run(20.0)
+    peak_px = np.abs(night.error_px(20.0)).max()
+    truth = basis(night.rig, "right")
+    learnt = design_with_margins(dataclasses.replace(truth, noise_px=1.5 * truth.noise_px))
+    night.report(design_json=parameters_json(learnt))
+    night.simulation.run(2.0)
+
+    assert night.loop.controller == "learnt"
+    assert np.abs(night.error_px(2.0)).max() < 1.25 * peak_px
 
 
 # ---------------------------------------------------------------- the way back
