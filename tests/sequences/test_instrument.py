@@ -34,6 +34,16 @@ def test_a_script_acquires_holds_and_gets_figures():
         assert mode(instrument) == "VERNIER"
 
 
+@pytest.mark.long
+def test_a_script_records_the_frames_for_the_spot_and_holds_the_star_again():
+    with Instrument(NEAR, simulate=True) as instrument:
+        instrument.acquire()
+        instrument.experiment("spot")
+
+        instrument.hold(1.0, settle_s=1.0)
+        assert mode(instrument) == "VERNIER"
+
+
 def test_what_is_refused_or_fails_raises_and_says_why():
     with Instrument(NEAR, simulate=True) as instrument:
         with pytest.raises(ConfigError, match=r"^hold: duration_s: must be greater than 0"):
