@@ -1,7 +1,7 @@
 """Where a spot is in a window, by least squares: as closely as its light and the pixels' noise allow.
 
 Eq. 7's centre of gravity weights each pixel by its distance, so that dark pixels far from the star bring
-most of its noise. A fit of the spot's known shape weights them by what they say: on FIT 0.0024 px instead
+most of its noise. A fit of the spot's known shape weights them by what they say: on FIT 0.0023 px instead
 of 0.0100.
 
 About a place, a spot of flux A on a background b is A (g - dx g_x - dy g_y) + b, with g its light on each
