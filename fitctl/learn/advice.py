@@ -50,6 +50,8 @@ TOLERATED = (0.85, 1.15)
 """A design does not compensate for a mirror's gain between these: its margins cover the deviation."""
 TOLERATED_IF_ALIAS = (0.7, 1.4)
 """The same if a line may be an alias, which spoils the estimate of the gain."""
+MORE_WRITES, MORE_WRITES_WORTH = 5, 0.95
+"""An operator is told of more writes of the D/A in a frame if they make the bound less by this factor."""
 _AXES = ("az", "el")
 _DESIGNS = ("present", "learnt")
 
@@ -113,6 +115,8 @@ class Advice(NamedTuple):
         RMS of the error on frames, az and el.
     present, learnt : Standing
     bound_px : float
+    more_writes_px : float
+        The bound with `MORE_WRITES` of the D/A in a frame.
     lines : tuple of LineAdvice
     design : Design
         The learnt one.
@@ -134,6 +138,7 @@ class Advice(NamedTuple):
     present: Standing
     learnt: Standing
     bound_px: float
+    more_writes_px: float
     lines: tuple[LineAdvice, ...]
     design: Design
     lately_px: tuple[float, float]
@@ -201,6 +206,7 @@ class Advice(NamedTuple):
             _standing_text("present", self.present, self.bound_px),
             _standing_text("learnt", self.learnt, self.bound_px),
             f"bound        {self.bound_px:.4f}",
+            *self._more_writes_hint(),
             "last minute  present {:.4f}, learnt {:.4f} px on frames, computed".format(
                 *self.lately_px
             ),
@@ -253,6 +259,15 @@ class Advice(NamedTuple):
             "then no aliases are counteracted in full"
         ]
 
+    def _more_writes_hint(self) -> list[str]:
+        """Tells an operator how much the hold between frames costs."""
+        if self.more_writes_px > MORE_WRITES_WORTH * self.bound_px:
+            return []
+        return [
+            f"             {self.more_writes_px:.4f} with fsm.dac.writes_per_frame = {MORE_WRITES}: the mirror "
+            "follows lines between frames"
+        ]
+
     def _filled_text(self) -> str:
         if not self.filled:
             return ""
@@ -282,6 +297,7 @@ class Advice(NamedTuple):
             "present": _standing_numbers(self.present),
             "learnt": _standing_numbers(self.learnt),
             "bound_px": self.bound_px,
+            "more_writes_px": self.more_writes_px,
             "lately_px": dict(zip(_DESIGNS, self.lately_px, strict=True)),
             "shown_gain_px": dict(zip(_DESIGNS, self.shown_px, strict=True)),
             "without_lines_px": dict(zip(_DESIGNS, self.without_lines_px, strict=True)),
@@ -338,6 +354,9 @@ def advise(
         present=present_stands,
         learnt=learnt_stands,
         bound_px=bound(truth).residual_px,
+        more_writes_px=bound(
+            dataclasses.replace(truth, writes=max(MORE_WRITES, truth.writes))
+        ).residual_px,
         lines=tuple(
             LineAdvice(
                 found,

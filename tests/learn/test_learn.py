@@ -233,6 +233,18 @@ def test_the_learnt_design_comes_near_the_bound_of_the_true_night(six_hz, fixed)
     assert advice.worth_it
 
 
+def test_an_operator_is_told_what_more_writes_of_the_mirror_would_allow(six_hz):
+    truth, advice = six_hz
+    several = bound(dataclasses.replace(truth, writes=5)).residual_px
+
+    assert advice.more_writes_px == pytest.approx(several, rel=0.15)
+    assert f"{advice.more_writes_px:.4f} with fsm.dac.writes_per_frame = 5" in "\n".join(
+        advice.lines_of_text()
+    )
+    still = advice._replace(more_writes_px=advice.bound_px)
+    assert "writes_per_frame" not in "\n".join(still.lines_of_text())
+
+
 def test_the_learnt_design_keeps_its_margins_on_the_true_night(six_hz):
     truth, advice = six_hz
 
