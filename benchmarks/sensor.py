@@ -1,7 +1,8 @@
 """What it costs to measure a star: the fit beside the centroid, on the same frames, in turns.
 
 The frames are those of a held star: anywhere within 0.3 px of the middle of a pixel. A bad pixel is known from
-the dark frame, a hot one is not; both are in the star's window.
+the dark frame, a hot one is not; both are in the star's window. A spot that is wider than the rig file has it
+has several pixels that look hot.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from fitctl.controllers.centroid import StarSensor
 from fitctl.model.image.scene import Scene
 
 LOOP = "right"
+WIDER = 1.13
 FRAMES = 64
 BAD_PX, HOT = (18, 21), HotPixel(az_px=22, el_px=19, dn=3000.0)  # row and column
 STAR_PX = np.array([20.0, 20.0])
@@ -29,8 +31,11 @@ def sensors_and_frames(folder: Path) -> dict[str, tuple[StarSensor, list[np.ndar
     """By case: who measures, and what."""
     cases = {}
     for sensor in ("centroid", "fit"):
-        for case, bad, hot in (("", False, False), ("a bad", True, False), ("a hot", False, True)):
+        for case in ("", "a bad pixel in the window", "a hot pixel in the window", "a wider spot"):
+            bad, hot = "bad" in case, "hot" in case
             settings = [f"loops.{LOOP}.sensor={sensor}"]
+            if "wider" in case:
+                settings.append(f"loops.{LOOP}.spot_diameter_px={3.0 / WIDER}")
             rig = load_rig(default_rig_path(), settings)
             if bad:
                 dark_dn = np.full((rig.camera.height_px, rig.camera.width_px), rig.camera.bias_dn)
@@ -42,8 +47,7 @@ def sensors_and_frames(folder: Path) -> dict[str, tuple[StarSensor, list[np.ndar
             spots = truth.stellar_loops[LOOP].spots[:1]
             scene = Scene(rig.camera, spots, [HOT] if hot else [])
             away_px = np.random.default_rng(1).uniform(-SPREAD_PX, SPREAD_PX, (FRAMES, 2))
-            name = f"{sensor}, {case} pixel in the window" if case else sensor
-            cases[name] = (
+            cases[f"{sensor}, {case}" if case else sensor] = (
                 StarSensor(rig.camera, rig.stellar_loops[LOOP]),
                 [scene.frame(STAR_PX + one[None], 1, n) for n, one in enumerate(away_px)],
             )

@@ -25,9 +25,8 @@ from fitctl.model.image.light import light_below
 
 Floats = NDArray[np.float64]
 STEPS_PER_PX = 8
-REACH_PX = (
-    1.5  # of the places for which there are weights, from the window's centre, along each axis
-)
+# Of the places for which there are weights, from the window's centre, along each axis.
+REACH_PX = 1.5
 NODES = int(REACH_PX * STEPS_PER_PX)
 PLACES = 2 * NODES + 1  # along an axis
 _SIDE = 2 * HALF_WINDOW_PX + 1
@@ -40,6 +39,9 @@ _OUTLIER_SIGMAS = 6.0
 # be by so many times. A spot that is wider than told misses at several pixels alike: without the worst one, two
 # or three of a spot that is 13 % narrower, 0.19, 0.14 and 0.09 of its misfit stay at least.
 _OTHERS_PARTS, _OTHERS_TIMES = (0.2, 0.1, 0.05), 2.0
+_MOST_WITHOUT = (
+    24  # pixels that do not count: with half of the window, the others determine the spot
+)
 _REMEMBERED = 1000  # weights, of 1.6 kB
 _AMOUNTS = 4  # flux, two moments, background
 
@@ -168,6 +170,8 @@ class SpotFit:
     ) -> SpotPlace | None:
         """Where the spot is that lies near a place; None if there is none within the window's reach.
 
+        Nor is there one where half of the pixels do not count.
+
         Parameters
         ----------
         light_dn : array, shape (7, 7)
@@ -177,6 +181,8 @@ class SpotFit:
         without : tuple of int, optional
             Pixels that do not count, row by row. A few more that miss the fit by far are left out.
         """
+        if len(without) > _MOST_WITHOUT:
+            return None
         pixels_dn = light_dn.ravel()
         found = self._converge(pixels_dn, az_px, el_px, without)
         if found is None:

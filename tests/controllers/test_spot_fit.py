@@ -130,6 +130,20 @@ def test_pixels_that_are_left_out_have_no_part_in_it(without):
     assert np.abs(weights[:, without]).max() < 1e-12
 
 
+@given(
+    st.sets(st.integers(0, 48), max_size=49),
+    st.floats(-2.0, 2.0),
+    st.floats(-2.0, 2.0),
+    st.integers(0, 1000),
+)
+def test_whatever_pixels_do_not_count_it_gives_numbers_or_no_spot(without, az_px, el_px, seed):
+    noise_dn = NOISE_DN * np.random.default_rng(seed).standard_normal((7, 7))
+    found = FIT.place(light(az_px, el_px) + noise_dn, az_px, el_px, tuple(sorted(without)))
+    assert found is None or np.isfinite(found).all()
+    if len(without) > 24:
+        assert found is None
+
+
 @pytest.mark.parametrize("noise_dn", [NOISE_DN, 3 * NOISE_DN])
 def test_how_sure_it_is_follows_from_the_pixels_and_not_from_what_it_was_told(noise_dn):
     louder = math.sqrt(noise_dn**2 - NOISE_DN**2)
