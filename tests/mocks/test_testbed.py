@@ -174,6 +174,62 @@ def test_the_bench_knows_where_the_stages_truly_are(running):
     assert "no loop is named left" in ask_bench(port, StagesQuestion("left"), StagesNow).error
 
 
+def images(camera, count, after_s=0.0):
+    """So many of the next frames that are exposed after `after_s`, shape (count, height, width)."""
+    found, end_s = [], time.monotonic() + 10
+    while len(found) < count and time.monotonic() < end_s:
+        frame = camera.next_frame(1.0)
+        if frame is not None and frame.mid_exposure_s > after_s:
+            found.append(frame.image.astype(float))
+    assert len(found) == count
+    return np.array(found)
+
+
+@pytest.mark.parametrize(
+    "running",
+    [("camera.electrons_per_dn=0.5", "camera.pixel_noise_dn=2.0")],
+    indirect=True,
+)
+def test_the_stars_own_light_has_photon_noise_on_the_wire(running, camera):
+    seen = images(camera, 60)
+    light_dn = seen.mean(axis=0) - running.rig.camera.bias_dn
+    lit = light_dn > 500
+    assert np.median(seen.var(axis=0)[lit] / light_dn[lit]) == pytest.approx(2.0, rel=0.25)
+
+
+FAST_LINE = (
+    "plant.loops.right.lines=[{frequency_hz=60.0,rms_px=0.8,direction_deg=0.0,damping=0.0,"
+    "drift_hz_per_min=0.0}]"
+)
+
+
+@pytest.mark.parametrize(
+    ("running", "smears"),
+    [((FAST_LINE,), False), ((FAST_LINE, "plant.exposure_instants=5"), True)],
+    indirect=["running"],
+)
+def test_what_moves_during_an_exposure_smears_the_spot_on_the_wire(running, camera, smears):
+    light_dn = images(camera, 60)[:, :, 16:] - running.rig.camera.bias_dn  # without the fringe spot
+    light_dn[light_dn < 100] = 0
+    columns, across = np.arange(light_dn.shape[2]), light_dn.sum(axis=1)
+    mean_px = (across * columns).sum(axis=1) / across.sum(axis=1)
+    wide_px2 = (across * (columns - mean_px[:, None]) ** 2).sum(axis=1) / across.sum(axis=1)
+    at_rest_px2 = 0.75**2 + 1 / 12  # of the spot, and of a pixel
+    assert (np.median(wide_px2) > 1.3 * at_rest_px2) == smears
+
+
+@pytest.mark.parametrize(
+    "running",
+    [("plant.timeline=[{at_s=2.0,pixel_noise_dn=200.0}]", "camera.pixel_noise_dn=10.0")],
+    indirect=True,
+)
+def test_a_night_changes_on_the_wire_when_its_timeline_says_so(running, camera):
+    before = images(camera, 5)[:, :8].std()
+    after = images(camera, 5, after_s=time.monotonic() + 2.2)[:, :8].std()
+    assert before == pytest.approx(10.0, rel=0.2)
+    assert after == pytest.approx(200.0, rel=0.2)
+
+
 def test_the_bench_answers_nonsense_with_an_error(running):
     port = running.endpoints["mocks.bench_port"]
 
