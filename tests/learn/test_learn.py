@@ -424,6 +424,25 @@ def test_a_mirror_that_moves_less_gets_a_design_that_commands_more(paper, fixed)
     assert margins(advice.design, truth).excess(Required()) < 1.02
 
 
+@pytest.mark.long
+def test_less_of_an_alias_is_counteracted_while_the_mirror_may_move_much_less(
+    paper, fixed, monkeypatch
+):
+    """What a design does that responds to the line more is hidden by a gain that is taken for too large."""
+    truth = dataclasses.replace(paper, lines=(Line(7.9, 0.005, 0.05),))
+    _, series = held(truth, fixed, TWO_MINUTES_S, seed=5)
+
+    def part(low):
+        def estimated_roughly(*arguments):
+            found = estimate(*arguments)
+            return found._replace(mirror_gain=Interval(0.96, low, 2 * 0.96 - low))
+
+        monkeypatch.setattr("fitctl.learn.advice.estimate", estimated_roughly)
+        return advise([series], (0.1, 0.1), paper, fixed).lines[0].part
+
+    assert part(0.7) < part(0.9)
+
+
 @pytest.mark.parametrize(("fastest_line_hz", "gain"), [(30.0, 0.73), (math.inf, 1.0)])
 def test_a_gain_that_a_fast_line_could_imitate_is_left_to_the_margins(
     paper, fixed, fastest_line_hz, gain
