@@ -41,8 +41,9 @@ class Limit:
         """Count one more; whether it is within the limit."""
         left, since_s = self._buckets.get(name, (self._at_once, now_s))
         left = min(self._at_once, left + (now_s - since_s) * self._per_s)
-        self._buckets[name] = (max(0.0, left - 1.0), now_s)
-        return left >= 1.0
+        within = left >= 1.0
+        self._buckets[name] = (left - within, now_s)
+        return within
 
 
 class Intake:

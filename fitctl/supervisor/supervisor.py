@@ -391,6 +391,8 @@ class Supervisor:
         return [name for name in self.loops if command.loop in {"", name}]
 
     def _obey(self, command: AnyCommand) -> Reply:
+        if isinstance(command, Stop):
+            self._stop_collector()  # a start that came before the stop was obeyed only now
         names = self._named(command)
         if not names:
             return _refusal(f"no loop is named {command.loop}; there are {', '.join(self.loops)}")

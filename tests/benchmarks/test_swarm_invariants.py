@@ -357,3 +357,14 @@ def test_a_collector_that_goes_on_after_a_stop_is_found(monkeypatch):
     monkeypatch.setattr(CollectorDrive, "stop", lambda _: None)
 
     assert "a stop stops the collector" in run(*happenings, rig=TESTBED, duration_s=14.0)
+
+
+@pytest.mark.long
+def test_a_stop_stops_a_collector_whose_start_waits_for_the_same_step():
+    happenings = (
+        Order(at_s=0.1, who="ada", command=MoveCollector(action="reference")),
+        Order(at_s=7.0, who="ada", command=Stop()),
+        Order(at_s=12.0, who="ada", command=MoveCollector(action="start")),
+        Order(at_s=12.002, who="ada", command=Stop()),
+    )
+    assert run(*happenings, rig=TESTBED, duration_s=18.0) == set()

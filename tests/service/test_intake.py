@@ -26,6 +26,13 @@ def test_no_more_come_in_than_the_rate_and_one_second_at_once(pauses_s):
     assert taken <= 10 * (now_s + 1) + 1e-6
 
 
+def test_who_always_sends_a_little_too_much_gets_as_much_as_the_rate_allows():
+    limit = Limit(10.0, 10.0)
+    taken = [limit.within("anna", number / 12.0) for number in range(12 * 60)]
+
+    assert sum(taken[12 * 30 :]) == pytest.approx(10 * 30, abs=2)
+
+
 def test_one_persons_flood_takes_nothing_from_another():
     limit = Limit(10.0, 10.0)
     for _ in range(100):
