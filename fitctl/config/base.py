@@ -34,22 +34,11 @@ def _name(text: str) -> str:
 
 
 Name = Annotated[str, AfterValidator(_name)]
-# Beyond all numbers of an instrument; products, quotients and squares of a few such numbers stay finite.
-_LEAST, _MOST = 1e-30, 1e15
-
-
-def _not_tiny(number: float) -> float:
-    if 0 < abs(number) < _LEAST:
-        msg = f"must be 0 or at least {_LEAST:g} in size"
-        raise ValueError(msg)
-    return number
-
-
-_Sized = AfterValidator(_not_tiny)
-Positive = Annotated[float, Field(gt=0, le=_MOST, allow_inf_nan=False), _Sized]
-NonNegative = Annotated[float, Field(ge=0, le=_MOST, allow_inf_nan=False), _Sized]
-Finite = Annotated[float, Field(ge=-_MOST, le=_MOST, allow_inf_nan=False), _Sized]
-Fraction = Annotated[float, Field(gt=0, le=1), _Sized]
+_MOST = 1e15  # beyond all numbers of an instrument; products and squares of a few such numbers stay finite
+Positive = Annotated[float, Field(gt=0, le=_MOST, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, le=_MOST, allow_inf_nan=False)]
+Finite = Annotated[float, Field(ge=-_MOST, le=_MOST, allow_inf_nan=False)]
+Fraction = Annotated[float, Field(gt=0, le=1)]
 TimeoutS = Annotated[float, Field(gt=0, le=60)]
 DelayS = Annotated[float, Field(ge=0, le=10)]
 OffsetSkyArcsec = Annotated[float, Field(ge=0, le=72_000)]

@@ -39,6 +39,7 @@ FULL_SCALE_DN = {"Mono8": 255, "Mono12": 4095, "Mono16": 65535}
 AIN_RANGES_V = (10.0, 1.0, 0.1, 0.01)  # of a LabJack T7's inputs, either way from zero
 PIEZO_LIMITS_V = (75.5, 100.5, 150.5)  # that an MDT693's limit switch reads at 75, 100 and 150 V
 LIMIT_TOLERANCE_V = 1.0  # within which the driver compares limits
+_LEAST_LIMIT_RAD = 1e-3
 _NETWORK_INTERFACE = re.compile(r"[^\s/:]{1,15}")
 _SLCAN_CHANNEL = "the adapter's serial port, such as /dev/ttyACM0, or socket://host:port"
 _SOCKETCAN_CHANNEL = "a network interface, such as can0"
@@ -158,6 +159,14 @@ class Cia402Device(Settings):
     drive_heartbeat_s: Annotated[float, Field(ge=0.01, le=10)]
     master_heartbeat_timeout_s: Annotated[float, Field(ge=0.02, le=10)]
     position_limit_rad: NonNegative
+
+    @field_validator("position_limit_rad")
+    @classmethod
+    def _is_none_or_a_real_one(cls, rad: float) -> float:
+        if 0 < rad < _LEAST_LIMIT_RAD:
+            msg = f"must be 0, which is no limit, or at least {_LEAST_LIMIT_RAD:g}"
+            raise ValueError(msg)
+        return rad
 
     @model_validator(mode="after")
     def _channel_is_of_the_interface(self) -> Cia402Device:
