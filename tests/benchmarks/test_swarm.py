@@ -47,7 +47,7 @@ OVERTAKEN = Plan(
 )
 
 
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [1, 3])
 def test_nothing_is_violated_whatever_fails(seed):
     assert run_plan(plan_of(seed)).violations == []
 

@@ -130,7 +130,9 @@ def test_toml_and_yaml_say_the_same(tmp_path, suffix):
             "steps: [{step: off, loop: !!python/object:os.system x}]",
             "not YAML: could not determine",
         ),
-        pytest.param("steps: " + "[" * 5000, "not YAML: ", id="5000 brackets"),
+        pytest.param(
+            "steps: " + "[" * 5000, "not YAML: ", id="5000 brackets", marks=pytest.mark.long
+        ),
         ("steps: [{step: off, loop: no}]", "loop 'no': rig fit-mock has right"),
         ("steps: [{step: wait, duration_s: 12:30}]", "must be a valid number (is '12:30')"),
         ("steps: [{step: wait, duration_s: yes}]", "must be a valid number (is 'yes')"),

@@ -61,8 +61,17 @@ def changed(snapshot):
     return changed
 
 
+OFTEN_TESTED = {"ACQUISITION", "VERNIER", "SAFE"}  # each mode takes seconds
+
+
 @pytest.mark.usefixtures("logs")
-@pytest.mark.parametrize("mode", MODE_NUMBERS)
+@pytest.mark.parametrize(
+    "mode",
+    [
+        pytest.param(mode, marks=[] if mode in OFTEN_TESTED else pytest.mark.long)
+        for mode in MODE_NUMBERS
+    ],
+)
 def test_every_screen_in_every_mode(changed, mode):
     views = [view for view in VIEWS if mode == "VERNIER" or view.name not in OF_NO_MODE]
     assert changed(FixedApp(FakeSupervisor(mode)), views=views) == []
