@@ -55,10 +55,8 @@ _MOST_UNREAD_S = 14.0  # interlock piezo_limit does not wait longer
 _CHECKED_S = 0.5  # so often the swarm checks which star a loop follows
 _ANOTHERS_PX = 6.0  # from its own star, no window of a loop shows its own
 _MOST_WRONG_S = 10.0
-_SAFE_S, _SAFE_BY_PIEZO_S = (
-    3.0,
-    8.0,
-)  # as `made_safe` in the fault catalogue, tests/faults/devices.py
+# As `made_safe` in the fault catalogue, tests/faults/devices.py.
+_SAFE_S, _SAFE_BY_PIEZO_S = 3.0, 8.0
 _STUCK_S = 1.0  # for so long after motors were stuck, a servo may still be behind its reference
 _RESTS_S = 1.0  # beyond the time after which a drive without its master stops by itself
 _HARDLY = 0.02  # of the velocity limit: slower, a servo corrects what its encoder counts
@@ -151,13 +149,18 @@ class Invariants:
         camera = rig.camera
         self._oldest_s = camera.frame_delay_s + _MOST_PERIODS * camera.period_s
         self._most_step_s = _MOST_STEP_S * (1 + len(self._stellar_loops))
-        self._resting_since_s = dict.fromkeys(rig.loops, 0.0)
         self._slowly: dict[str, bool] = {}
-        self._powerless_since_s: dict[str, float] = {}
-        self._unneeded_since_s: dict[str, float] = {}
         self._busy_since_s = math.inf
         self._stepped_s = 0.0
+        self._powerless, self._unneeded = _Lasting(), _Lasting()
         self._silent, self._turning, self._stopped_for = _Lasting(), _Lasting(), _Lasting()
+        self._lasting = (
+            self._powerless,
+            self._unneeded,
+            self._silent,
+            self._turning,
+            self._stopped_for,
+        )
         self._ticked_s = self._stall_ended_s = 0.0
         self._jogged_s: dict[str, float] = {}
         self._collector_is_stopped = False
@@ -208,11 +211,9 @@ class Invariants:
         self._texts.clear()
         self._piezo_read_s = dict.fromkeys(self._rig.loops, math.inf)
         self._slowly.clear()
-        self._powerless_since_s.clear()
-        self._unneeded_since_s.clear()
         self._wrong_since_s.clear()
         self._pointed_at.clear()
-        for lasting in (self._silent, self._turning, self._stopped_for):
+        for lasting in self._lasting:
             lasting.clear()
         self._jogged_s.clear()
         self._collector_is_stopped = False
@@ -233,10 +234,7 @@ class Invariants:
         self._ticked_s += added_s  # so that a stall is not left out twice
         for name in self._stopped_s:
             self._stopped_s[name] = max(self._stopped_s[name], self._stepped_s)
-        for since_s in (self._powerless_since_s, self._unneeded_since_s):
-            for name in since_s:
-                since_s[name] += added_s
-        for lasting in (self._silent, self._turning, self._stopped_for):
+        for lasting in self._lasting:
             lasting.leave_out(added_s)
 
     def zero_lost(self, name: str) -> None:
@@ -577,7 +575,7 @@ class Invariants:
         return ", ".join(sorted(wrong)) if kind == "piezo" else ""
 
     def _turns(self, name: str, mode: Mode, now_s: float) -> None:
-        """Motors stand still in OFF and SAFE, unless their drive watches nobody and cannot be reached."""
+        """Motors stand still in OFF and SAFE; a drive without a watchdog cannot be stopped over a bad line."""
         amplifiers = self._amplifiers[name]
         line = amplifiers.line
         turns = mode in _AT_REST and amplifiers.velocity_rad_s != (0.0, 0.0)
@@ -617,27 +615,22 @@ class Invariants:
         if amplifiers.watches_nobody and (
             name not in self._opened or not amplifiers.line.connected
         ):
-            self._unneeded_since_s.pop(name, None)
+            self._unneeded.lasted_s(name, is_so=False, now_s=now_s)
             return
         reachable = amplifiers.line.connected and not amplifiers.line.faults
-        needs = mode not in _AT_REST
-        if needs and not busy and not amplifiers.powered:
-            since_s = self._powerless_since_s.setdefault(name, now_s)
-            if now_s - since_s > POWER_S:
-                self.violated(
-                    "a loop that points has power", f"{name}: none in {mode.name} for {POWER_S:g} s"
-                )
-        else:
-            self._powerless_since_s.pop(name, None)
-        if mode in _AT_REST and not busy and amplifiers.powered and (reachable or mode is Mode.OFF):
-            since_s = self._unneeded_since_s.setdefault(name, now_s)
-            most_s = POWER_S + (
-                self._rig.supervisor.safe_disable_after_s if mode is Mode.SAFE else 0.0
+        rests = mode in _AT_REST
+        powerless_s = self._powerless.lasted_s(
+            name, is_so=not (rests or busy or amplifiers.powered), now_s=now_s
+        )
+        if powerless_s > POWER_S:
+            self.violated(
+                "a loop that points has power", f"{name}: none in {mode.name} for {POWER_S:g} s"
             )
-            if now_s - since_s > most_s:
-                self.violated(
-                    "amplifiers have no power that nobody needs",
-                    f"{name}: powered in {mode.name} for {most_s:g} s",
-                )
-        else:
-            self._unneeded_since_s.pop(name, None)
+        unneeded = rests and not busy and amplifiers.powered and (reachable or mode is Mode.OFF)
+        unneeded_s = self._unneeded.lasted_s(name, is_so=unneeded, now_s=now_s)
+        most_s = POWER_S + (self._rig.supervisor.safe_disable_after_s if mode is Mode.SAFE else 0.0)
+        if unneeded_s > most_s:
+            self.violated(
+                "amplifiers have no power that nobody needs",
+                f"{name}: powered in {mode.name} for {most_s:g} s",
+            )

@@ -78,10 +78,8 @@ _SLOW_SLEW = 0.4  # fraction of interrupted slews on a slow line
 _SLEW_S = 1.5  # a slew is interrupted within this time of its beginning,
 _MEETS_S = 0.1  # and a stall follows within this
 _WRONG = 0.25  # fraction of strikes with wrong values, on devices that can have some
-_SKY, _TOLD = (
-    0.15,
-    0.5,
-)  # fraction of runs with each change of the sky; of those that the rig file knows
+# Fraction of runs with each change of the sky, and of those that the rig file knows.
+_SKY, _TOLD = 0.15, 0.5
 PHOTON_NOISE = "camera.electrons_per_dn=1.0"
 _AT_ONCE_S = 0.004  # mean delay between hurried commands
 _LONG_STALL, _SILENT = 0.3, 0.5  # fractions of disturbed rests
@@ -264,19 +262,18 @@ def slow_servos(rig: str, which: int) -> list[str]:
     ] + [f"interlocks.following_error.high={(3.0, 8.0)[which]}"]
 
 
+def stars_of(rig: str) -> list[str]:
+    """The loops of a rig that point a star."""
+    return [loop for loop in RIGS[rig] if loop != "metrology"]
+
+
 def several_writes(rig: str) -> list[str]:
     """Settings with which a rig's mirrors are written several times a frame."""
     return [
         f"loops.{loop}.{key}"
-        for loop in RIGS[rig]
-        if loop != "metrology"
+        for loop in stars_of(rig)
         for key in ("fsm.dac.writes_per_frame=5", "vernier.controller=minimum-variance")
     ]
-
-
-def stars_of(rig: str) -> list[str]:
-    """The loops of a rig that point a star."""
-    return [loop for loop in RIGS[rig] if loop != "metrology"]
 
 
 def vibrating(rig: str, frequency_hz: float, rms_px: float, direction_deg: float) -> list[str]:

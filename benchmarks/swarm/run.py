@@ -79,9 +79,8 @@ NO_EXCEPTION = "no exception escapes"
 HEAL_S = 60.0  # within which a loop must hold its star again
 _HISTORY_S = 20.0  # a frame may come so late, after several stalls in a row
 _ANSWER_S = 5.0
-_ANSWERED_AT_THE_END_S = (
-    1.5  # when the service has ended: younger commands and answers may be under way
-)
+# When the service has ended: younger commands and answers may be under way.
+_ANSWERED_AT_THE_END_S = 1.5
 _WIND_DOWN_S = 1.0  # as fitctl.daemon.run
 _START_S = 2.0
 _LAST_RECORDS_S = 5.0

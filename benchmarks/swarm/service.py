@@ -55,10 +55,8 @@ _LOCAL_S = (1e-5, 1e-3)
 _REMOTE_S = (1e-3, 0.3)
 _GARBAGE = 0.02  # of the messages
 _MOST_GARBAGE_BYTES = 200
-_FLOOD, _FLOOD_S = (
-    20,
-    2.0,
-)  # so many refusals within that time may be followed by some without an answer
+# So many refusals within that time may be followed by some without an answer.
+_FLOOD, _FLOOD_S = 20, 2.0
 
 
 class _Frame(NamedTuple):

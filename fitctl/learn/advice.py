@@ -51,7 +51,7 @@ TOLERATED = (0.85, 1.15)
 TOLERATED_IF_ALIAS = (0.7, 1.4)
 """The same if a line may be an alias, which spoils the estimate of the gain."""
 MORE_WRITES, MORE_WRITES_WORTH = 5, 0.95
-"""An operator is told of more writes of the D/A in a frame if they make the bound less by this factor."""
+"""The advice mentions so many writes of the D/A in a frame if they lower the bound to this part of it."""
 _AXES = ("az", "el")
 _DESIGNS = ("present", "learnt")
 

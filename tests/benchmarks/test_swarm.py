@@ -20,7 +20,6 @@ from benchmarks.swarm.threads import (
     VirtualExecutor,
     VirtualLock,
     VirtualThreading,
-    VirtualTime,
 )
 from fitctl.messages.commands import Recover, Release, Stop
 
@@ -175,13 +174,6 @@ def test_a_plan_has_commands_and_faults_in_their_order():
     times_s = [happening.at_s for happening in plan.happenings]
     assert times_s == sorted(times_s)
     assert {type(happening) for happening in plan.happenings} >= {Order, Strike}
-
-
-@pytest.fixture
-def time():
-    time = VirtualTime()
-    yield time
-    time.end()
 
 
 def test_threads_go_on_in_the_order_of_their_deadlines(time):

@@ -12,7 +12,6 @@ from benchmarks.swarm.devices.sensors import SwarmCamera, SwarmPhotodiodes
 from benchmarks.swarm.plan import Order, Plan, Strike
 from benchmarks.swarm.run import RIGS as FOLDER
 from benchmarks.swarm.run import run_plan
-from benchmarks.swarm.threads import VirtualTime
 from fitctl.config import load_rig
 from fitctl.drivers.interface import DeviceFault, DeviceMismatch
 from fitctl.logging.records import ModeChange
@@ -20,13 +19,6 @@ from fitctl.model.plant import Plant
 from fitctl.simulation.devices import SimulatedMirror
 
 RIG = load_rig(FOLDER / "fit-testbed.toml")
-
-
-@pytest.fixture
-def time():
-    time = VirtualTime()
-    yield time
-    time.end()
 
 
 @pytest.fixture

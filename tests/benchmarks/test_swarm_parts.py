@@ -41,7 +41,6 @@ from benchmarks.swarm.run import RIGS as FOLDER
 from benchmarks.swarm.run import run_plan
 from benchmarks.swarm.service import SENDERS
 from benchmarks.swarm.telemetry_wire import RemoteConsole
-from benchmarks.swarm.threads import VirtualTime
 from fitctl.config import load_rig
 from fitctl.logging.queue import RecordQueue
 from fitctl.logging.records import Event, RecorderStatus
@@ -87,13 +86,6 @@ def gives(at_s, command, who="ada"):
 
 
 # ------------------------------------------------------------ the recorder
-
-
-@pytest.fixture
-def time():
-    time = VirtualTime()
-    yield time
-    time.end()
 
 
 @pytest.fixture

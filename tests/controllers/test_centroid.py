@@ -8,6 +8,7 @@ from fitctl.controllers.centroid import StarSensor
 from fitctl.model.image.scene import Scene
 
 NOWHERE = (-500.0, -500.0)
+EDGES = ("left", "right", "bottom", "top")
 window_fits = st.tuples(st.floats(3.0, 36.0), st.floats(3.0, 36.0))
 
 
@@ -25,6 +26,17 @@ def expose(rig):
         return scene.frame(np.array([star, fringe]), seed, 1)
 
     return frame
+
+
+def from_edge(edge, away_px, along_px):
+    """A place, so far from an edge of the frame."""
+    places = (
+        (away_px, along_px),
+        (39.0 - away_px, along_px),
+        (along_px, away_px),
+        (along_px, 39.0 - away_px),
+    )
+    return places[EDGES.index(edge)]
 
 
 # ---------------------------------------------------------------- Eq. 7
@@ -118,15 +130,10 @@ def test_noise_alone_is_never_a_star(sensor, expose):
 @given(
     beyond=st.floats(-2.0, 1.5),
     along=st.floats(0.0, 39.0),
-    edge=st.sampled_from(["left", "right", "bottom", "top"]),
+    edge=st.sampled_from(EDGES),
 )
 def test_a_spot_cut_by_the_frames_edge_is_not_accepted(sensor, expose, beyond, along, edge):
-    place = {
-        "left": (beyond, along),
-        "right": (39.0 - beyond, along),
-        "bottom": (along, beyond),
-        "top": (along, 39.0 - beyond),
-    }[edge]
+    place = from_edge(edge, beyond, along)
     assert sensor.find(expose(place)) is None
 
 
@@ -141,16 +148,11 @@ def fitted(*settings):
 @given(
     away=st.floats(2.0, 3.0),
     along=st.floats(2.0, 37.0),
-    edge=st.sampled_from(["left", "right", "bottom", "top"]),
+    edge=st.sampled_from(EDGES),
 )
 def test_near_an_edge_of_the_frame_the_fit_is_as_good(expose, away, along, edge):
     _, sensor = fitted()
-    place = {
-        "left": (away, along),
-        "right": (39.0 - away, along),
-        "bottom": (along, away),
-        "top": (along, 39.0 - away),
-    }[edge]
+    place = from_edge(edge, away, along)
     star = sensor.in_window(expose(place), *place)
     assert (star.az_px, star.el_px) == pytest.approx(place, abs=6 * 0.0024)
 

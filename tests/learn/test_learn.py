@@ -428,7 +428,7 @@ def test_a_mirror_that_moves_less_gets_a_design_that_commands_more(paper, fixed)
 def test_less_of_an_alias_is_counteracted_while_the_mirror_may_move_much_less(
     paper, fixed, monkeypatch
 ):
-    """What a design does that responds to the line more is hidden by a gain that is taken for too large."""
+    """Computed with too large a gain, a design that amplifies an alias looks harmless."""
     truth = dataclasses.replace(paper, lines=(Line(7.9, 0.005, 0.05),))
     _, series = held(truth, fixed, TWO_MINUTES_S, seed=5)
 

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from benchmarks.swarm.lines import Line, identity
 from benchmarks.swarm.threads import VirtualTime
 from fitctl.config import Rig
-from fitctl.config.devices import FULL_SCALE_DN
 from fitctl.drivers.interface import (
     CameraCounts,
     DeviceIdentity,
@@ -42,7 +41,7 @@ class SwarmCamera(SimulatedCamera):
         self._period_s = rig.camera.period_s
         self._random = random
         self._image: NDArray[Any] | None = None  # of the newest frame
-        self._full_scale_dn = FULL_SCALE_DN[rig.camera.device.pixel_format]
+        self._full_scale_dn = rig.camera.full_scale_dn
         self._streams = False
         self._lost = 0
         self._clear_dn = self._scene._flux_dn

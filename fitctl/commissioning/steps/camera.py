@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.commissioning.outcome import Outcome, Site, StepError
-from fitctl.config.devices import FULL_SCALE_DN
 from fitctl.daemon.devices import CAMERAS
 from fitctl.drivers.interface import CameraDriver, DeviceError, Frame
 
@@ -131,8 +130,7 @@ def _hot_pixels(image: NDArray[np.float64], noise_dn: float) -> list[tuple[int, 
 
 def _refuse(settings: Any, figures: dict[str, float]) -> None:
     """Raise StepError for what no key of the rig file puts right."""
-    full_dn = FULL_SCALE_DN[settings.device.pixel_format]
-    if figures["brightest_dn"] >= full_dn:
+    if figures["brightest_dn"] >= settings.full_scale_dn:
         msg = (
             f"a pixel reads {figures['brightest_dn']:.0f} DN, all that "
             f"{settings.device.pixel_format} has: the star "
