@@ -30,14 +30,17 @@ class Motors:
         self._time = time
         self._angle_rad = [7.0, -11.0]
         self._velocity_rad_s = (0.0, 0.0)
-        self._enabled = [False, False]
+        self.enabled = [False, False]
+        self.had_power = [Course(), Course()]
+        for course in self.had_power:
+            course.add(time.now_s, False)
         self._at_s = time.now_s
 
     def position_rad(self) -> tuple[float, float]:
         """Both angles."""
         now_s = self._time.now_s
         for axis, velocity in enumerate(self._velocity_rad_s):
-            self._angle_rad[axis] += velocity * (now_s - self._at_s) * self._enabled[axis]
+            self._angle_rad[axis] += velocity * (now_s - self._at_s) * self.enabled[axis]
         self._at_s = now_s
         az_rad, el_rad = self._angle_rad
         return az_rad, el_rad
@@ -50,7 +53,8 @@ class Motors:
     def set_enabled(self, axis: int, enabled: bool) -> None:
         """Switch the current on or off."""
         self.position_rad()
-        self._enabled[axis] = enabled
+        self.enabled[axis] = enabled
+        self.had_power[axis].add(self._time.now_s, enabled)
 
 
 class AmplifierBench(Bench):
@@ -80,13 +84,22 @@ class AmplifierBench(Bench):
         self.time.call_later(0.001, self._watch)
 
     def _enable(self) -> None:
-        self.driver.enable()
+        self._obeyed(self.driver.enable, powered=True)
 
     def _disable(self) -> None:
-        self.driver.disable()
+        self._obeyed(self.driver.disable, powered=False)
 
     def _reset(self) -> None:
-        self.driver.reset_fault()
+        self._obeyed(self.driver.reset_fault, powered=False)
+
+    def _obeyed(self, command: Callable[[], None], *, powered: bool) -> None:
+        """Give a command, during which each axis must have come to have power, or to have none."""
+        begin_s = self.time.now_s
+        command()
+        for axis, had_power in enumerate(self.motors.had_power):
+            if powered not in had_power.between(begin_s, self.time.now_s):
+                msg = f"axis {axis} {'enabled' if powered else 'disabled'}, is not"
+                raise Mistaken(msg)
 
     def _exchange(self) -> None:
         self._velocity += 1

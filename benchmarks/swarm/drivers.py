@@ -11,6 +11,7 @@ serial line no answer arrives after the driver has stopped waiting for late ones
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from functools import partial
 from random import Random
 from typing import Any
@@ -133,7 +134,7 @@ class Mdt693Bench(Bench):
     """The piezo amplifier on RS-232."""
 
     def __init__(self, time: WireTime, troubles: Iterator[Trouble | None]) -> None:
-        rig = rig_of()
+        rig = rig_of("fit-mock.toml", "mocks.loops.right.mdt693.readback_settling_s=0")
         mocks: Any = rig.mock_parts()[1]
         piezo = rig.stellar_loops["right"].fsm.piezo
         super().__init__(
@@ -145,14 +146,13 @@ class Mdt693Bench(Bench):
         )
         settings = mocks.loops["right"].mdt693
         self._amplifier = Amplifier(settings, piezo.gain, lambda _volts: None, time.time)
-        self._amplifier.set_external_input_v([1.0, 4.0, 6.0])
+        self._number = 0
         self._controller = Controller(settings, self._amplifier)
         self._limit_v = piezo.limit_v
         self._pending = b""
         self.driver = Mdt693(piezo)
         self.calls = [self._volts, self._limit]
         self.most_s = 60 * piezo.response_timeout_s
-        time.sleep(60.0)  # until its measurements settle
 
     def hear(self, data: bytes) -> None:
         """Pass commands, each ended by a CR, to the device."""
@@ -167,6 +167,8 @@ class Mdt693Bench(Bench):
         self._pending = b""
 
     def _volts(self) -> None:
+        self._number += 1
+        self._amplifier.set_external_input_v([1 + (self._number + i) % 5 for i in range(3)])
         volts = self.driver.stack_volts()
         true_v = np.array(self._amplifier.outputs_v)
         if not np.abs(volts - true_v).max() < 2.5:  # it measures with an offset and noise
@@ -336,33 +338,28 @@ def run_wire(
         Any other error of a call that is not a `DeviceError`.
     """
     time, ended = WireTime(), dict[str, int]()
-    coming: Iterator[Trouble | None] = iter(troubles)
     holder: list[Bench] = []
-
-    def troubles_once_open() -> Iterator[Trouble | None]:
-        yield from coming
-
     # The mock's timers need the wire's event loop, but the bench makes the wire.
     wire = _Deferred(lambda: holder[0].wire)
     with virtual(time, wire):  # type: ignore[arg-type]
-        bench = BENCHES[name](time, troubles_once_open())
+        bench = BENCHES[name](time, iter(troubles))
         holder.append(bench)
-        is_open = False
-        for number, pause_s in calls:
-            time.sleep(pause_s)
-            call = bench.calls[number % len(bench.calls)] if is_open else bench.driver.open
-            began_s, outcome = time.now_s, "value"
-            try:
-                call()
-                is_open = True
-            except DeviceError as error:
-                outcome, is_open = type(error).__name__, False
-            took_s = time.now_s - began_s
-            if took_s > bench.most_s:
-                msg = f"a call took {took_s:.2f} s, at most {bench.most_s:.2f} s"
-                raise Mistaken(msg)
-            ended[outcome] = ended.get(outcome, 0) + 1
-        bench.driver.close()
+        with closing(bench.driver):
+            is_open = False
+            for number, pause_s in calls:
+                time.sleep(pause_s)
+                call = bench.calls[number % len(bench.calls)] if is_open else bench.driver.open
+                began_s, outcome = time.now_s, "value"
+                try:
+                    call()
+                    is_open = True
+                except DeviceError as error:
+                    outcome, is_open = type(error).__name__, False
+                took_s = time.now_s - began_s
+                if took_s > bench.most_s:
+                    msg = f"a call took {took_s:.2f} s, at most {bench.most_s:.2f} s"
+                    raise Mistaken(msg)
+                ended[outcome] = ended.get(outcome, 0) + 1
     return ended
 
 

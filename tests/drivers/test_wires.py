@@ -16,9 +16,14 @@ from benchmarks.swarm.camera_wire import RARE_KINDS
 from benchmarks.swarm.drivers import BENCHES, NIGHTS, run_wire
 from benchmarks.swarm.wires import KINDS, Trouble
 from fitctl.drivers.c887.link import C887Link
+from fitctl.drivers.cia402.node import Node
+from fitctl.drivers.endpoint import Endpoint
+from fitctl.drivers.ensemble import driver as ensemble
+from fitctl.drivers.ensemble.link import EnsembleLink
 from fitctl.drivers.gige import gvcp, heartbeat
 from fitctl.drivers.gige.stream import FrameAssembler
 from fitctl.drivers.labjack_t7.driver import LabJackT7
+from fitctl.drivers.mdt693 import driver as mdt693
 from fitctl.drivers.modbus_dac import link as dac_link
 from fitctl.drivers.modbus_dac.driver import ModbusDac
 
@@ -106,20 +111,60 @@ def oldest_request(self, _answer):
     return self._outstanding.popleft() if self._outstanding else None
 
 
-class Unread:
-    """A port that never shows what has arrived."""
+class SomePort:
+    """A port that says how much of what has arrived it shows."""
 
-    def __init__(self, port):
-        self._port = port
-        self.in_waiting = 0
+    def __init__(self, port, in_waiting):
+        vars(self).update(_port=port, in_waiting=in_waiting)
 
     def __getattr__(self, name):
         return getattr(self._port, name)
 
+    def __setattr__(self, name, value):
+        setattr(self._port, name, value)
+
 
 def unread(self):
     """What arrived late is not noticed before the next question."""
-    self._port = Unread(self._port)
+    self._port = SomePort(self._port, in_waiting=0)
+
+
+def open_unread(self, device):
+    OPEN_ENSEMBLE(self, device)
+    unread(self)
+
+
+def byte_by_byte(self, *arguments, **options):
+    """What follows an answer is left for the next question."""
+    return SomePort(OPEN_SERIAL(self, *arguments, **options), in_waiting=1)
+
+
+def its_question(data):
+    """The question that an answer begins with."""
+    return data.decode("ascii", "replace").lstrip(MDT693_FRAME).partition("\r")[0]
+
+
+def complete_to_any(_command, data):
+    return COMPLETE(its_question(data), data.lstrip(MDT693_FRAME.encode()))
+
+
+def answer_to_any(_command, data):
+    return PARSE(its_question(data), data.lstrip(MDT693_FRAME.encode()))
+
+
+def any_bits(text):
+    """A position passes for bits."""
+    return int(float(text))
+
+
+def request(self, frame, what, **options):
+    SDO[0] = frame
+    return REQUEST_SDO(self, frame, what, **options)
+
+
+def any_object(self, data):
+    """The next answer, whichever object it is of."""
+    self._answer = data[:1] + SDO[0][1:4] + data[4:]
 
 
 def any_answer(packet):
@@ -146,6 +191,9 @@ def uncounted(self, block):
 
 DECODE, REQUEST, NEXT_ID = gvcp.protocol.decode_answer, [0], gvcp.ControlChannel._next_id
 BEGIN, MISS = FrameAssembler._begin, FrameAssembler._miss
+OPEN_ENSEMBLE, OPEN_SERIAL = EnsembleLink.__init__, Endpoint.open_serial
+COMPLETE, PARSE, MDT693_FRAME = mdt693.is_complete, mdt693.parse_answer, " \r\n\0>*"
+REQUEST_SDO, SDO = Node._request, [b""]
 POP, SEND, NUMBER = dac_link.pop_answer, dac_link.TcpLink.send, [0]
 MISTAKES = {
     "D/A over Modbus/TCP": [
@@ -155,6 +203,13 @@ MISTAKES = {
     "D/A over Modbus RTU": [
         (ModbusDac, "confirm", lambda self: setattr(self, "_unconfirmed", None))
     ],
+    "MDT693": [
+        (Endpoint, "open_serial", byte_by_byte),
+        (mdt693, "is_complete", complete_to_any),
+        (mdt693, "parse_answer", answer_to_any),
+    ],
+    "Ensemble": [(EnsembleLink, "__init__", open_unread), (ensemble, "parse_bits", any_bits)],
+    "CiA 402 over SLCAN": [(Node, "_request", request), (Node, "_on_sdo", any_object)],
     "LabJack T7": [(LabJackT7, "_request_of", oldest_request)],
     "C-887": [(C887Link, "resynchronise", unread)],
 }
