@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fitctl.config import HALF_WINDOW_PX, Camera, Loop
 from fitctl.controllers.dark import Dark
-from fitctl.controllers.spot_fit import SpotFit, spot_fit
+from fitctl.controllers.spot_fit import SpotFit, SpotPlace, spot_fit
 from fitctl.model.compiled import compilable
 from fitctl.model.image.light import centroid_noise_px, light_below
 
@@ -98,6 +98,8 @@ class StarSensor:
         How the star is measured; None for the centroid.
     other_light : list of OtherLight
         Spots of other loops. Their light is subtracted from a window, or it would pull this loop's star.
+    near_spots : list of OtherSpot
+        The loop's own other spots, where their light reaches into the star's window: a fit subtracts it.
     """
 
     def __init__(self, camera: Camera, loop: Loop) -> None:
@@ -105,6 +107,11 @@ class StarSensor:
         self.other_light: list[OtherLight] = []
         self._dark = Dark(camera)
         self.threshold_dn = loop.acquisition.detection_sigma * camera.pixel_noise_dn
+        self.near_spots = [
+            spot
+            for spot in loop.other_spots
+            if _reaches(spot.offset_px.az, spot.offset_px.el, loop.spot_diameter_px)
+        ]
         self._flux_range = loop.flux_range
         self._camera, self._loop = camera, loop
         self.largest_az_px, self.largest_el_px = camera.largest_window_px
@@ -191,8 +198,7 @@ class StarSensor:
         side = _LEVER_PX.size
         light_dn = self._dark.light(image, el - HALF_WINDOW_PX, az - HALF_WINDOW_PX, side, side)
         for spot in self.other_light:
-            reach_px = side / 2 + REACH_DIAMETERS * spot.diameter_px
-            if max(abs(spot.az_px - az), abs(spot.el_px - el)) < reach_px:
+            if _reaches(spot.az_px - az, spot.el_px - el, spot.diameter_px):
                 light_dn -= spot_light(spot, az, el)
         flux_dn, az_moment, el_moment = _SUMS.dot(light_dn.ravel()).tolist()
         peak_dn = light_dn.item(light_dn.argmax())  # `max` takes four times as long
@@ -205,10 +211,30 @@ class StarSensor:
         top, left = el - HALF_WINDOW_PX, az - HALF_WINDOW_PX
         without = self._dark.without_measurement(image, top, left, side, side)
         place = self.fit.place(light_dn, az_px, el_px, without)
+        if place is not None and self.near_spots:
+            light_dn -= self._near_light(place, az, el)
+            place = self.fit.place(light_dn, place.az_px, place.el_px, without)
         if place is None:
             return None
         az_px, el_px, _, az_sigma_px, el_sigma_px = place
         return Star(az + az_px, el + el_px, flux_dn, az, el, az_sigma_px, el_sigma_px)
+
+    def _near_light(
+        self, star: SpotPlace, window_az_px: int, window_el_px: int
+    ) -> NDArray[np.float64]:
+        """What the loop's own near spots leave in a window, with its star at a place in it, shape (7, 7)."""
+        az_px, el_px = window_az_px + star.az_px, window_el_px + star.el_px
+        part, diameter_px = star.flux_dn / self._loop.star_flux_dn, self._loop.spot_diameter_px
+        spots = (
+            OtherLight(
+                az_px + spot.offset_px.az,
+                el_px + spot.offset_px.el,
+                part * spot.flux_dn,
+                diameter_px,
+            )
+            for spot in self.near_spots
+        )
+        return np.sum([spot_light(spot, window_az_px, window_el_px) for spot in spots], axis=0)
 
     def _accepted(self, star: Star | None) -> Star | None:
         if star is None or not self.flux_low_dn <= star.flux_dn <= self.flux_high_dn:
@@ -239,6 +265,12 @@ def _noise_px(fit: SpotFit | None, camera: Camera, loop: Loop, star_flux_dn: flo
             camera, star_flux_dn, 2 * HALF_WINDOW_PX + 1, loop.spot_diameter_px
         )
     return fit.noise_px(star_flux_dn)
+
+
+def _reaches(away_az_px: float, away_el_px: float, diameter_px: float) -> bool:
+    """Whether a spot so far from a window's centre leaves light in the window."""
+    away_px = max(abs(away_az_px), abs(away_el_px))
+    return away_px < _LEVER_PX.size / 2 + REACH_DIAMETERS * diameter_px
 
 
 def spot_light(spot: OtherLight, az_px: int, el_px: int) -> NDArray[np.float64]:

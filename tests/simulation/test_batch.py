@@ -291,6 +291,13 @@ def test_a_rig_with_more_changes_than_fit_is_refused():
         Batch(rig_with(f"plant.timeline=[{changes}]"))
 
 
+def test_a_spot_in_its_own_stars_window_is_refused_where_the_star_is_fitted():
+    ghost = "{name='ghost', offset_px={az=4.0, el=0.0}, flux_dn=4000.0}"
+
+    with pytest.raises(BatchRefusalError, match="spot ghost reaches into its star's window"):
+        Batch(rig_with("loops.right.sensor=fit", f"loops.right.other_spots=[{ghost}]"))
+
+
 def test_a_rig_with_more_lines_than_fit_is_refused():
     line = "{frequency_hz=6.0, rms_px=0.0, direction_deg=0.0, damping=0.0, drift_hz_per_min=0.0}"
 

@@ -90,6 +90,12 @@ def star_settings(
     sensor, mirror = StarSensor(camera, loop), Mirror(fsm)
     pointing = Pointing(rig, loop_name, target_px, design_for(rig, loop_name))
     pair = pointing.pair
+    if sensor.fit is not None and sensor.near_spots:
+        name = sensor.near_spots[0].name
+        msg = (
+            f"spot {name} reaches into its star's window, and the batch does not subtract its light"
+        )
+        raise BatchRefusalError(msg)
     spots = np.array([[spot.offset_px.az, spot.offset_px.el] for spot in plant.spots])
     noise_px = sensor_noise_px(rig.camera, loop, plant.spots[0].flux_dn)
     if pointing.design.uses_noise and noise_ratio(pointing.design, noise_px) > _MOST_NOISE_RATIO:
