@@ -572,7 +572,7 @@ class Invariants:
         if kind == "siderostat":
             return self._amplifiers[name].fault
         wrong = self._lines[device].wrong
-        return ", ".join(sorted(wrong)) if kind == "piezo" else ""
+        return ", ".join(sorted(wrong)) if kind in {"D/A", "piezo"} else ""
 
     def _turns(self, name: str, mode: Mode, now_s: float) -> None:
         """Motors stand still in OFF and SAFE; a drive without a watchdog cannot be stopped over a bad line."""

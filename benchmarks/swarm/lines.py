@@ -25,15 +25,19 @@ FAULTS = ("slow", "deaf", "mute", "refuses", "garbled", "unplugged")
 answers that make no sense, and a cable that is unplugged."""
 WRONG: dict[str, tuple[str, ...]] = {
     "siderostat": ("trip", "stuck"),
+    "D/A": ("tripped",),
     "piezo": ("stuck", "limit"),
     "camera": ("frozen", "drops", "saturated"),
     "photodiodes": ("saturated",),
+    "hexapod": ("offset", "stuck", "servos off"),
 }
 """Faults of a device whose line is well, by kind of device.
 
-Amplifiers detect a fault of their own, or motors do not move. A stack has the highest voltage, or the limit
-switch is at another voltage. The camera repeats an image, loses half of its frames, or has all pixels at full
-scale. Photodiodes are at the end of their range.
+Amplifiers detect a fault of their own, or motors do not move. A D/A's watchdog has tripped: its outputs are at
+their safe voltages, and it refuses every request. A stack has the highest voltage, or the limit switch is at
+another voltage. The camera repeats an image, loses half of its frames, or has all pixels at full scale.
+Photodiodes are at the end of their range. The hexapod reports a wrong pose, accepts moves and does not move, or
+its servos are off.
 """
 SILENCE = frozenset(FAULTS) - {"slow"}
 """Faults during which no answer arrives that makes sense."""

@@ -4,17 +4,21 @@ from functools import partial
 from itertools import pairwise
 from random import Random
 
+import numpy as np
 import pytest
 
 from benchmarks.swarm.devices.amplifiers import SwarmAmplifiers
-from benchmarks.swarm.devices.mirror import SwarmPiezo
+from benchmarks.swarm.devices.hexapod import SwarmHexapod
+from benchmarks.swarm.devices.mirror import SwarmDac, SwarmPiezo
 from benchmarks.swarm.devices.sensors import SwarmCamera, SwarmPhotodiodes
-from benchmarks.swarm.plan import Order, Plan, Strike
+from benchmarks.swarm.lines import WRONG
+from benchmarks.swarm.plan import Order, Plan, Strike, kind_of
 from benchmarks.swarm.run import RIGS as FOLDER
 from benchmarks.swarm.run import run_plan
 from fitctl.config import load_rig
-from fitctl.drivers.interface import DeviceFault, DeviceMismatch
-from fitctl.logging.records import ModeChange
+from fitctl.drivers.interface import DeviceFault, DeviceMismatch, DeviceRefused, Pose
+from fitctl.logging.records import Event, ModeChange
+from fitctl.messages.commands import MoveCollector
 from fitctl.model.plant import Plant
 from fitctl.simulation.devices import SimulatedMirror
 
@@ -139,6 +143,62 @@ def test_a_piezo_amplifier_has_a_stack_at_its_limit_or_another_limit(time, plant
     assert isinstance(does(piezo.limit_v), DeviceMismatch)
 
 
+def test_a_dac_whose_watchdog_has_tripped_is_at_its_safe_voltages_and_refuses(time, plant, does):
+    mirror = SimulatedMirror(plant.loops["right"], time, RIG, "right")
+    dac = SwarmDac(mirror, time, RIG, "right", Random(1), lambda *_written: None)
+    does(dac.open)
+    wanted_v = np.array([1.0, 2.0, 3.0])
+
+    def write():
+        dac.send_v(wanted_v)
+        dac.confirm()
+
+    does(write)
+    assert does(dac.read_v) == pytest.approx(wanted_v, abs=0.001)
+    dac.line.wrong["tripped"] = 0.0
+
+    assert isinstance(does(write), DeviceRefused)
+    assert isinstance(does(dac.read_v), DeviceRefused)
+    assert mirror.read_v() == pytest.approx(5.0, abs=0.001)
+    dac.line.heal("tripped")
+    assert does(dac.read_v) == pytest.approx(5.0, abs=0.001)
+
+
+@pytest.fixture
+def hexapod(time, plant, does):
+    hexapod = SwarmHexapod(plant, time, RIG, Random(1))
+    does(hexapod.open)
+    does(hexapod.reference)
+    return hexapod
+
+
+FAR = Pose(5.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def test_a_hexapod_reports_another_x(hexapod, does):
+    hexapod.line.wrong["offset"] = 0.0
+
+    assert does(hexapod.pose).pose.x_mm == 1.0
+
+
+def test_a_stuck_hexapod_accepts_a_move_and_does_not_move(hexapod, does):
+    hexapod.line.wrong["stuck"] = 0.0
+
+    assert does(partial(hexapod.move_to, FAR, 1.0)) is None
+    assert not hexapod.moves
+
+
+def test_a_hexapod_without_servos_brakes_and_refuses_to_move(hexapod, does, time):
+    does(partial(hexapod.move_to, FAR, 1.0))
+    hexapod.line.wrong["servos off"] = 0.0
+
+    assert not does(hexapod.pose).servos_on
+    time.run_until(time.now_s() + 0.5)
+    assert not hexapod.moves
+    assert does(hexapod.pose).pose.x_mm < 1.0
+    assert isinstance(does(partial(hexapod.move_to, FAR, 1.0)), DeviceRefused)
+
+
 def test_photodiodes_are_at_the_end_of_their_range(time, plant, does):
     photodiodes = SwarmPhotodiodes(plant.loops["metrology"], time, RIG, "metrology", Random(1))
     does(photodiodes.open)
@@ -163,6 +223,7 @@ def test_photodiodes_are_at_the_end_of_their_range(time, plant, does):
         ("right siderostat", "stuck", "following error"),
         ("right piezo", "stuck", "stack 2"),
         ("right piezo", "limit", "its limit"),
+        ("right D/A", "tripped", "a refusal"),
     ],
 )
 def test_a_wrong_value_leads_to_safe_and_violates_nothing(device, fault, reason):
@@ -186,14 +247,38 @@ def test_a_wrong_value_leads_to_safe_and_violates_nothing(device, fault, reason)
 @pytest.mark.long
 @pytest.mark.parametrize("device", ["camera", "metrology photodiodes"])
 def test_a_sensor_with_wrong_values_violates_nothing(device):
-    faults = ("frozen", "drops", "saturated") if device == "camera" else ("saturated",)
     happenings = [
         *[Order(at_s=at_s, who="ada") for at_s in (0.1, 2.0, 4.0)],
         *[
             Strike(at_s=25.0 + 14.0 * number, device=device, fault=fault, lasts_s=9.0)
-            for number, fault in enumerate(faults)
+            for number, fault in enumerate(WRONG[kind_of(device)])
         ],
     ]
     plan = Plan(seed=1, rig="fit-testbed.toml", settings=[], duration_s=70.0, happenings=happenings)
 
     assert run_plan(plan).violations == []
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("fault", "reported"),
+    [("offset", "of its course"), ("stuck", "of its course"), ("servos off", "servos that are on")],
+)
+def test_a_hexapod_that_goes_wrong_under_way_violates_nothing(fault, reported):
+    errors = []
+
+    def on_record(record):
+        if isinstance(record, Event) and record.severity == "error":
+            errors.append(record.message)
+
+    happenings = [
+        Order(at_s=0.1, who="ada"),
+        Order(at_s=2.0, who="ada", command=MoveCollector(action="reference")),
+        Order(at_s=12.0, who="ada", command=MoveCollector(action="start")),
+        Strike(at_s=14.0, device="hexapod", fault=fault, lasts_s=9.0),
+    ]
+    plan = Plan(seed=1, rig="fit-testbed.toml", settings=[], duration_s=30.0, happenings=happenings)
+
+    assert run_plan(plan, on_record).violations == []
+    assert len(errors) == 1
+    assert reported in errors[0]

@@ -24,6 +24,7 @@ from fitctl.simulation.devices import (
 
 Floats = NDArray[np.float64]
 _REFERENCE_S = 5.0
+_OFFSET_MM = 1.0
 
 
 class SwarmHexapod(SimulatedHexapod):
@@ -63,11 +64,30 @@ class SwarmHexapod(SimulatedHexapod):
     def move_to(self, pose: Pose, velocity_mm_s: float) -> None:
         """Start a move."""
         self._sent(pose, velocity_mm_s)
-        self.line.ask(partial(super().move_to, pose, velocity_mm_s))
+        self.line.ask(partial(self._move, pose, velocity_mm_s))
+
+    def _move(self, pose: Pose, velocity_mm_s: float) -> None:
+        if self._servos_off():
+            raise self._refusal("servos that are on", "off", "switch them on")
+        if "stuck" not in self.line.wrong:
+            super().move_to(pose, velocity_mm_s)
 
     def pose(self) -> HexapodReading:
         """Read the pose."""
-        return self.line.ask(super().pose)
+        servos_off = self._servos_off()
+        reading = self.line.ask(super().pose)
+        if "offset" in self.line.wrong:
+            reading = reading._replace(
+                pose=reading.pose._replace(x_mm=reading.pose.x_mm + _OFFSET_MM)
+            )
+        return reading._replace(servos_on=not servos_off)
+
+    def _servos_off(self) -> bool:
+        """Whether they are; if so, the platform brakes."""
+        off = "servos off" in self.line.wrong
+        if off and self.moves:
+            super().stop()
+        return off
 
     def stop(self) -> None:
         """Brake, and wait until the platform is at rest."""

@@ -15,6 +15,7 @@ from fitctl.config import Rig
 from fitctl.drivers.interface import (
     DeviceIdentity,
     DeviceMismatch,
+    DeviceRefused,
 )
 from fitctl.simulation.devices import (
     SimulatedMirror,
@@ -74,8 +75,8 @@ class SwarmDac:
         """Read the outputs, in three exchanges."""
         self.confirm()
         for _ in range(2):
-            self.line.ask(self._mirror.read_v)
-        return self.line.ask(self._mirror.read_v)
+            self.line.ask(self._outputs_v)
+        return self.line.ask(self._outputs_v)
 
     def close(self) -> None:
         """Disconnect."""
@@ -84,10 +85,23 @@ class SwarmDac:
 
     def reset(self) -> None:
         """Restart at the safe voltages."""
-        self._mirror.send_v(np.full(3, self._safe_v))
+        self._make_safe()
         self.line.connected = False
 
+    def _make_safe(self) -> None:
+        self._mirror.send_v(np.full(3, self._safe_v))
+
+    def _outputs_v(self) -> Floats:
+        self._refuse_if_tripped()
+        return self._mirror.read_v()
+
+    def _refuse_if_tripped(self) -> None:
+        if "tripped" in self.line.wrong:
+            self._make_safe()
+            raise DeviceRefused("D/A", self.line.endpoint, "to obey", "a refusal", "reset it")
+
     def _set(self, volts: Floats) -> None:
+        self._refuse_if_tripped()
         self._mirror.send_v(volts)
         self._written_s = self._time.now_s()
         if not self._watched:
@@ -100,7 +114,7 @@ class SwarmDac:
             self._time.call_at(due_s, self._watch)
             return
         self._watched = False
-        self._mirror.send_v(np.full(3, self._safe_v))
+        self._make_safe()
 
 
 class SwarmPiezo:
