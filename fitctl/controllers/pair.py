@@ -6,6 +6,8 @@ linear is here, once for all designs: the mirror's diamond, and the deadzone fee
 
 from __future__ import annotations
 
+import functools
+import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -95,6 +97,16 @@ class Design:
     def writes(self) -> int:
         """Of the D/A, in a frame period."""
         return len(self.d) - 1
+
+    @functools.cached_property
+    def digest(self) -> str:
+        """Of all that it computes with: two designs with one digest do the same."""
+        digest = hashlib.sha256(
+            f"{self.period_s} {self.delay_s} {self.hysteresis_inverse}".encode()
+        )
+        for matrix in (self.a, self.b, self.c, self.d):
+            digest.update(f"{matrix.shape}".encode() + np.ascontiguousarray(matrix).tobytes())
+        return digest.hexdigest()
 
     @property
     def title(self) -> str:

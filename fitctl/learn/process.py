@@ -32,15 +32,14 @@ class LoopLearner:
         self.loop_name = loop_name
         self._rig = rig
         self._learner = Learner(rig, loop_name)
-        self._controller = ""
-        self._noise_px: float | None = None
+        self._state: LoopState | None = None
         self._report: Future[LearnerReport] | None = None
 
     def hear(self, telemetry: Telemetry, state: LoopState) -> None:
         """One message."""
-        self._controller = state.design
-        self._noise_px = state.noise_px
-        self._learner.watch(f"{self._controller} {self._noise_px}", telemetry.time_s)
+        self._state = state
+        key = f"{state.design} {state.controller_digest} {state.noise_px}"
+        self._learner.watch(key, telemetry.time_s)
         for tick in telemetry.ticks:
             if tick.loop == self.loop_name:
                 self._learner.add(tick)
@@ -50,15 +49,20 @@ class LoopLearner:
         ready = None
         if self._report is not None and self._report.done():
             ready, self._report = self._report.result(), None
-        if self._report is None and self._learner.due:
-            self._report = executor.submit(self._make, self._controller, self._noise_px)
+        if self._report is None and self._state is not None and self._learner.due:
+            self._report = executor.submit(self._make, self._state)
         return ready
 
-    def _make(self, controller: str, noise_px: float | None) -> LearnerReport:
+    def _make(self, state: LoopState) -> LearnerReport:
         try:
-            present = design_for(self._rig, self.loop_name, controller, noise_px)
+            present = design_for(self._rig, self.loop_name, state.design, state.noise_px)
         except ConfigError as error:  # such as a design file that is gone
             return self._learner.failed(str(error))
+        if state.controller_digest not in {"", present.digest}:
+            return self._learner.failed(
+                f"{state.controller_file} has changed since the loop loaded it; to learn, load it again with "
+                "fitctl send controller"
+            )
         return self._learner.report(present)
 
 

@@ -650,7 +650,7 @@ class StellarLoop(Loop):
 
     def state(self, now_s: float) -> LoopState:
         """The newest of everything, for consoles."""
-        scale, mode = self._scale, self.mode
+        scale, mode, design = self._scale, self.mode, self.pointing.design
         centre_rad = self.search.centre_rad - self.search.sky_rad
         centre_sky_arcsec = (centre_rad * scale.motor_sky_arcsec_per_rad).tolist()
         az_urad, el_urad = (1e6 * self.mirror.bias_offset_rad).tolist()
@@ -674,7 +674,8 @@ class StellarLoop(Loop):
                 )
                 for spot in self.settings.other_spots
             ],
-            controller_file=self.pointing.design.file,
+            controller_file=design.file,
+            controller_digest=design.digest if design.file else "",
             search_again=self.search.state_again(self.mode_since_s)
             if mode is Mode.ACQUISITION
             else None,

@@ -149,13 +149,13 @@ class LearningState(msgspec.Struct, frozen=True, kw_only=True):
 class LoopState(msgspec.Struct, frozen=True, kw_only=True):
     """One loop as consoles show it.
 
-    ``controller_file`` is the saved design in force, on the supervisor's machine; it is empty when the
-    design was made from the rig's values. ``outcomes`` are those of the
-    commands under way, and of the last that ended. ``kind`` is the loop's in the rig file; a metrology loop's
-    ``requirement_px`` is its requirement on the beam in the camera's pixels. ``waits_for`` is what the loop
-    waits for while it holds its stages where they are, for people; empty while it waits for nothing.
-    ``noise_px`` is the sensor's noise for which the design was made anew, from the star's measured light; null
-    for a design for the light of the rig file.
+    ``controller_file`` is the saved design in force, on the supervisor's machine, and ``controller_digest``
+    stands for the design as it was loaded; both are empty when the design was made from the rig's values.
+    ``outcomes`` are those of the commands under way, and of the last that ended. ``kind`` is the loop's in the
+    rig file; a metrology loop's ``requirement_px`` is its requirement on the beam in the camera's pixels.
+    ``waits_for`` is what the loop waits for while it holds its stages where they are, for people; empty while
+    it waits for nothing. ``noise_px`` is the sensor's noise for which the design was made anew, from the star's
+    measured light; null for a design for the light of the rig file.
     """
 
     name: str
@@ -173,6 +173,7 @@ class LoopState(msgspec.Struct, frozen=True, kw_only=True):
     search_centre_sky_arcsec: tuple[float, float] | None = None
     other_spots: list[SpotPlace] = []
     controller_file: str = ""
+    controller_digest: str = ""
     search_again: SearchAgain | None = None
     outcomes: list[CommandOutcome] = []
     last_failure: LoopFailure | None = None

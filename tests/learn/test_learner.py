@@ -12,6 +12,7 @@ from samples.learner_reports import SHAKEN, learnt_json
 from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.basis import basis
 from fitctl.controllers.design.choose import design_for
+from fitctl.controllers.design.files import save_design
 from fitctl.controllers.design.theory import loop_theory
 from fitctl.learn.advice import estimated
 from fitctl.learn.learner import EVERY_S, FIRST_S, SETTLE_S, WINDOW_S, Learner
@@ -189,20 +190,41 @@ def test_the_process_knows_the_learnt_design_in_force(rig, ticks):
     )  # it was made for a night without the line
 
 
-def test_a_design_that_cannot_be_made_gives_a_report_with_the_reason(rig, vernier, monkeypatch):
+def reported(rig, vernier, monkeypatch, **state):
+    """The first report, on few frames; there is no second one."""
     monkeypatch.setattr("fitctl.learn.learner.FIRST_S", 1.0)
-    heard = message(vernier[:500], controller_file="gone.json")
+    heard = message(vernier[:500], **state)
     learner = LoopLearner(rig, "right")
     learner.hear(heard, heard.loops[0])
     with ThreadPoolExecutor(1) as executor:
         learner.work(executor)
         executor.submit(int).result()
         report = learner.work(executor)
-        again = learner.work(executor)
+        assert learner.work(executor) is None
+    return report
+
+
+def test_a_design_that_cannot_be_made_gives_a_report_with_the_reason(rig, vernier, monkeypatch):
+    report = reported(rig, vernier, monkeypatch, controller_file="gone.json")
 
     assert report.design_json == ""
     assert "gone.json" in report.text
-    assert again is None
+
+
+def test_nothing_is_learnt_by_a_design_file_that_has_changed_since_it_was_loaded(
+    rig, vernier, monkeypatch, tmp_path
+):
+    file = tmp_path / "mine.json"
+    loaded = design_for(rig, "right", "minimum-variance")
+    state = {"controller_file": str(file), "controller_digest": loaded.digest}
+    save_design(loaded, file)
+    assert "mine.json" not in reported(rig, vernier, monkeypatch, **state).text
+
+    save_design(design_for(rig, "right", "fslq"), file)
+    report = reported(rig, vernier, monkeypatch, **state)
+
+    assert report.design_json == ""
+    assert "has changed since the loop loaded it" in report.text
 
 
 def test_after_a_long_gap_only_new_frames_count(rig, vernier):

@@ -278,11 +278,13 @@ def test_telemetry_tells_which_file_the_design_at_work_is_from(tmp_path, monkeyp
 
     def at_work():
         state = simulation.supervisor.loops["right"].state(simulation.clock.now_s())
-        return state.controller, state.controller_file
+        return state.controller, state.controller_file, state.controller_digest
 
-    assert at_work() == ("eq20", str(tmp_path / "mine.json"))
+    loaded = design_for(rig, "right").digest
+    save_design(design_for(rig, "right", "fslq"), tmp_path / "mine.json")
+    assert at_work() == ("eq20", str(tmp_path / "mine.json"), loaded)
     simulation.command(SetController(name="eq20"))
-    assert at_work() == ("eq20", "")
+    assert at_work() == ("eq20", "", "")
 
 
 def test_the_siderostat_stays_within_its_travel(simulate_with):
