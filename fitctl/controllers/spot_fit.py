@@ -39,6 +39,8 @@ _OUTLIER_SIGMAS = 6.0
 # be by so many times. A spot that is wider than told misses at several pixels alike: without the worst one, two
 # or three of a spot that is 13 % narrower, 0.19, 0.14 and 0.09 of its misfit stay at least.
 _OTHERS_PARTS, _OTHERS_TIMES = (0.2, 0.1, 0.05), 2.0
+# Where another width explains such a part of the misfit, no pixel is an outlier.
+_WIDTH_PART = 0.85
 _MOST_WITHOUT = (
     24  # pixels that do not count: with half of the window, the others determine the spot
 )
@@ -102,10 +104,16 @@ def gaussian_shape(diameter_px: float, az_px: Floats, el_px: Floats) -> Floats:
     return np.asarray((down[..., :, None] * across[..., None, :]).reshape(*az_px.shape, -1))
 
 
-def _terms(diameter_px: float) -> Floats:
-    """Light, minus its slopes, and background on each pixel, at each node, shape (rows, columns, 49, 4)."""
+def _nodes_px() -> tuple[Floats, Floats]:
+    """Azimuth and elevation of each node, shapes (rows, columns)."""
     places = np.arange(-NODES, NODES + 1) / STEPS_PER_PX
     el_px, az_px = np.meshgrid(places, places, indexing="ij")
+    return az_px, el_px
+
+
+def _terms(diameter_px: float) -> Floats:
+    """Light, minus its slopes, and background on each pixel, at each node, shape (rows, columns, 49, 4)."""
+    az_px, el_px = _nodes_px()
     step = _SLOPE_STEP_PX
     ahead_az, behind_az, ahead_el, behind_el = (
         gaussian_shape(diameter_px, az_px + az_step, el_px + el_step)
@@ -159,8 +167,23 @@ class SpotFit:
         leverage = np.einsum("rcpt,rctp->rcp", self._terms, self.weights)
         # What the fit would miss without a pixel (Cook and Weisberg, Residuals and Influence, 1982).
         self._missed_per_dn = 1 / (self._deviation_dn * np.sqrt(1 - leverage))
+        self._wider = self._misfit_of_another_width(diameter_px)
         # Bad pixels stay where they are, and a star that is held lies at a few nodes.
         self._weights_without = functools.lru_cache(_REMEMBERED)(self._leave_out)
+
+    def _misfit_of_another_width(self, diameter_px: float) -> Floats:
+        """What a spot that is a little wider misses the fit by at each node, shape (nodes, nodes, 49).
+
+        In parts of each pixel's noise, and of length 1.
+        """
+        az_px, el_px = _nodes_px()
+        narrow, wide = (
+            gaussian_shape((1 + step) * diameter_px, az_px, el_px)
+            for step in (-_SLOPE_STEP_PX, _SLOPE_STEP_PX)
+        )
+        change = (wide - narrow)[..., None]
+        left = (change - self._terms @ (self.weights @ change))[..., 0] / self._deviation_dn
+        return np.asarray(left / np.linalg.norm(left, axis=-1, keepdims=True))
 
     def _variance_dn2(self, light_dn: Floats) -> Floats:
         return self._noise_dn**2 + self._photon_dn * np.maximum(light_dn, 0.0)
@@ -187,7 +210,7 @@ class SpotFit:
         found = self._converge(pixels_dn, az_px, el_px, without)
         if found is None:
             return None
-        if (worst := self._outlier(found)) is not None:
+        if (worst := self._outlier(found)) is not None and not self._has_another_width(found):
             found, without = self._without_outliers(pixels_dn, found, without, worst)
         left_dn, az_weights, el_weights = found.left_dn, found.weights[1], found.weights[2]
         if self._photon_dn:  # in parts of each pixel's noise
@@ -229,6 +252,12 @@ class SpotFit:
         worst = int(missed.argmax())
         limit_2 = _OUTLIER_SIGMAS**2 * self._expected_2(found)
         return worst if missed.item(worst) ** 2 > limit_2 else None
+
+    def _has_another_width(self, found: _Solution) -> bool:
+        """Most of the misfit is that of a spot that is wider or narrower than told."""
+        deviations = found.left_dn / self._deviation_dn[found.node]
+        of_width = float(deviations.dot(self._wider[found.node]))
+        return of_width**2 >= _WIDTH_PART * float(deviations.dot(deviations))
 
     def _without_outliers(
         self, pixels_dn: Floats, found: _Solution, without: tuple[int, ...], worst: int | None
