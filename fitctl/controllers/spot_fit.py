@@ -210,7 +210,7 @@ class SpotFit:
         found = self._converge(pixels_dn, az_px, el_px, without)
         if found is None:
             return None
-        if (worst := self._outlier(found)) is not None and not self._has_another_width(found):
+        if (worst := self._outlier(found)) is not None:
             found, without = self._without_outliers(pixels_dn, found, without, worst)
         left_dn, az_weights, el_weights = found.left_dn, found.weights[1], found.weights[2]
         if self._photon_dn:  # in parts of each pixel's noise
@@ -253,18 +253,16 @@ class SpotFit:
         limit_2 = _OUTLIER_SIGMAS**2 * self._expected_2(found)
         return worst if missed.item(worst) ** 2 > limit_2 else None
 
-    def _has_another_width(self, found: _Solution) -> bool:
-        """Most of the misfit is that of a spot that is wider or narrower than told."""
-        deviations = found.left_dn / self._deviation_dn[found.node]
-        of_width = float(deviations.dot(self._wider[found.node]))
-        return of_width**2 >= _WIDTH_PART * float(deviations.dot(deviations))
-
     def _without_outliers(
         self, pixels_dn: Floats, found: _Solution, without: tuple[int, ...], worst: int | None
     ) -> tuple[_Solution, tuple[int, ...]]:
         """Without the few pixels that spoil a fit; as it was if they are not few, or not outliers."""
+        deviations = found.left_dn / self._deviation_dn[found.node]
+        misfit = float(deviations.dot(deviations))
+        if float(deviations.dot(self._wider[found.node])) ** 2 >= _WIDTH_PART * misfit:
+            return found, without  # a spot that is wider or narrower than told
         left_out, fewer = without, found
-        expected = _OTHERS_TIMES * pixels_dn.size * self._expected_2(found)
+        expected = pixels_dn.size * self._expected_2(found)
         for _ in _OTHERS_PARTS:
             if worst is None:
                 break
@@ -273,14 +271,14 @@ class SpotFit:
             tried = self._converge(pixels_dn, fewer.az_px, fewer.el_px, left_out)
             if tried is None:
                 break
-            if self._misfit(tried) <= max(part * self._misfit(found), expected):
-                found, without = tried, left_out
+            deviations = tried.left_dn / self._deviation_dn[tried.node]
+            left = float(deviations.dot(deviations))
+            if left <= max(part * misfit, _OTHERS_TIMES * expected):
+                found, without, misfit = tried, left_out, left
+            if left <= expected:
+                break
             fewer, worst = tried, self._outlier(tried)
         return found, without
-
-    def _misfit(self, found: _Solution) -> float:
-        deviations = found.left_dn / self._deviation_dn[found.node]
-        return float(deviations.dot(deviations))
 
     def _expected_2(self, found: _Solution) -> float:
         """What a pixel may miss: its noise, and the steps between nodes; in variances."""

@@ -82,9 +82,11 @@ def test_a_spot_that_is_13_percent_wider_than_told_is_found_within_0_006_px():
 @pytest.mark.parametrize("diameter_px", [2.6, 3.39, 4.0])
 def test_no_pixel_of_a_spot_of_another_width_is_tried_as_an_outlier(monkeypatch, diameter_px):
     # To try three of them takes 40 µs a frame.
-    monkeypatch.setattr(SpotFit, "_without_outliers", None)
+    monkeypatch.setattr(
+        SpotFit, "_leave_out", lambda _self, _node, without: pytest.fail(f"{without}")
+    )
 
-    errors(FIT, diameter_px=diameter_px)
+    errors(SpotFit(DIAMETER_PX, NOISE_DN, FLUX_DN), diameter_px=diameter_px)
 
 
 def hot(dn, *, known):
