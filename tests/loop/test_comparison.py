@@ -9,12 +9,13 @@ from benchmarks.linear_loop import held
 from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.basis import basis
 from fitctl.controllers.design.choose import design_for
+from fitctl.controllers.design.linear_loop.on_paper import SETTLE_S
 from fitctl.controllers.design.minimum_variance import design_minimum_variance
-from fitctl.loop.comparison import comparison
+from fitctl.loop.comparison import ON_PAPER, comparison
 from fitctl.model.optics import scales
 
 NOISE_PX = 0.03
-SECONDS = 90.0
+SECONDS = 60.0
 
 
 @pytest.fixture(scope="module")
@@ -33,9 +34,9 @@ def with_air(night, times):
     return dataclasses.replace(night, air_path=air)
 
 
-def followed(rig, truth, learnt, compared, seed):
+def followed(rig, truth, learnt, compared, seed, seconds=SECONDS):
     """Whether a comparison sends the loop back, on frames of a loop with the learnt design."""
-    error_px, series = held(truth, learnt, SECONDS, seed)
+    error_px, series = held(truth, learnt, seconds, seed)
     scale = scales(rig, rig.stellar_loops["right"])
     # What all stages did counts as the siderostat's.
     stages_px = error_px - series.disturbance_px
@@ -69,6 +70,22 @@ def test_a_design_that_is_better_stays(rig, noisy, seed):
     compared = comparison(rig, "right", learnt, before, NOISE_PX)
 
     assert followed(rig, truth, learnt, compared, seed) == ""
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize(("times", "goes_back"), [(0.95, True), (0.6, False)])
+def test_a_design_that_gains_nothing_is_left_after_a_minute(rig, noisy, seed, times, goes_back):
+    truth, before = with_air(noisy, times), design_minimum_variance(with_air(noisy, 0.95))
+    learnt = design_minimum_variance(truth)
+    seconds = SETTLE_S + ON_PAPER[-1][0]
+
+    def why(seconds):
+        compared = comparison(rig, "right", learnt, before, NOISE_PX)
+        return followed(rig, truth, learnt, compared, seed, seconds)
+
+    assert why(seconds - 1.0) == ""
+    assert ("over 60 s" in why(seconds + 1.0)) == goes_back
 
 
 def test_a_design_that_is_unstable_on_the_learnt_ones_mirror_is_not_compared(rig, noisy):

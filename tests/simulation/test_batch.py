@@ -487,8 +487,7 @@ def learns_at_once(monkeypatch):
     """A learner that reports after half a minute, and a loop that goes back seconds after a change."""
     monkeypatch.setattr("fitctl.learn.learner.FIRST_S", 25.0)
     monkeypatch.setattr("fitctl.learn.learner.EVERY_S", 10.0)
-    monkeypatch.setattr("fitctl.loop.comparison.OVER_S", 2.0)
-    monkeypatch.setattr("fitctl.loop.comparison.MOST_ON_PAPER", 0.1)
+    monkeypatch.setattr("fitctl.loop.comparison.ON_PAPER", ((2.0, 0.1),))
 
 
 SIX_HZ = (
