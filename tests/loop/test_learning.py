@@ -352,7 +352,7 @@ def test_a_night_that_becomes_louder_is_no_reason_to_go_back():
     night = Night("loops.right.vernier.controller=minimum-variance", louder)
     same = design_with_margins(PAPER)
     night.report(design_json=parameters_json(same), measured_px=0.016, learnt_camera_px=0.016)
-    night.simulation.run(90.0 - night.simulation.clock.now_s())
+    night.simulation.run(65.0 - night.simulation.clock.now_s())
     state = night.loop.state(0.0).learning
 
     assert state.state == "in force"
