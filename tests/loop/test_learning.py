@@ -347,7 +347,7 @@ def test_a_line_that_beats_is_no_reason_to_go_back():
 def test_a_night_that_becomes_louder_is_no_reason_to_go_back():
     """The design before would leave more, too."""
     louder = (
-        "plant.timeline=[{at_s=40.0,loops={right={air_path={gain_px=1.2,b1_s2=0.517,b2_s=2.5}}}}]"
+        "plant.timeline=[{at_s=20.0,loops={right={air_path={gain_px=1.2,b1_s2=0.517,b2_s=2.5}}}}]"
     )
     night = Night("loops.right.vernier.controller=minimum-variance", louder)
     same = design_with_margins(PAPER)
