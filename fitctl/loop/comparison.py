@@ -19,12 +19,13 @@ from fitctl.controllers.pair import Design
 from fitctl.model.optics import AzEl, Scales, scales
 
 Floats = NDArray[np.float64]
-ON_PAPER = ((30.0, 1.03), (60.0, 0.99))
+WATCHES = ((10.0, 1.06, math.inf), (30.0, 1.03, 1.1), (60.0, 0.99, math.inf))
 """Over a time constant in s, the learnt design may leave so much of the residual that the design before would
-have left, both on paper. One that gains nothing for long is not worth what paper does not know: on random night
-3615 it left 0 % more on paper, and 3.6 % more on the plant."""
-MOST_MEASURED = 1.1
-"""Over the first of these, it may leave so much on frames, where hysteresis and backlash add to it."""
+have left, both on paper, and so much on frames, where hysteresis and backlash add to it.
+
+One that gains nothing for long is not worth what paper does not know: on random night 3615 it left 0 % more on
+paper, and 3.6 % more on the plant.
+"""
 MOST_NOISE = 0.8
 """At most so much of what the design before would have left on frames counts as noise."""
 _BEFORE = 1  # of what is measured, what the design before leaves, and what the learnt one leaves
@@ -63,7 +64,7 @@ class Comparison:
         self._mirror_gain, self._overshoot = loop_basis.mirror_gain, loop_basis.overshoot
         self._settle_frames = round(SETTLE_S / loop_basis.period_s)
         self._over_frames = np.array(
-            [round(over_s / loop_basis.period_s) for over_s, _ in ON_PAPER]
+            [round(over_s / loop_basis.period_s) for over_s, *_ in WATCHES]
         )
         self.restart()
 
@@ -75,7 +76,7 @@ class Comparison:
         self._frames = 0
         self._first_px: Floats | None = None
         self._mirror_px: Floats | None = None
-        self._means_px2 = np.zeros((len(ON_PAPER), 3, 2))
+        self._means_px2 = np.zeros((len(WATCHES), 3, 2))
 
     def observe(self, error_px: AzEl, mirror_rad: Floats, motor_rad: Floats) -> None:
         """One frame: the star's error, and mirror and motors as :meth:`.Learning.observe` has them."""
@@ -107,20 +108,17 @@ class Comparison:
     def why_back(self) -> str:
         """Why the design before is the better one; empty as long as it is not known to be."""
         counted = self._frames - self._settle_frames
-        known = [
-            (*means_px2.max(axis=1).tolist(), over_s, most)
-            for means_px2, over, (over_s, most) in zip(
-                self._means_px2, self._over_frames, ON_PAPER, strict=True
-            )
-            if counted >= over
-        ]
-        for _, before_px2, learnt_px2, over_s, most in known:
+        for means_px2, over, (over_s, most_on_paper, most_measured) in zip(
+            self._means_px2, self._over_frames, WATCHES, strict=True
+        ):
+            if counted < over:
+                break
+            measured_px2, before_px2, learnt_px2 = means_px2.max(axis=1).tolist()
             noise_px2 = min(self._noise_px2, MOST_NOISE * before_px2)
-            if learnt_px2 - noise_px2 > most**2 * (before_px2 - noise_px2):
+            if learnt_px2 - noise_px2 > most_on_paper**2 * (before_px2 - noise_px2):
                 left = f"would leave {math.sqrt(learnt_px2 - noise_px2):.4f} px besides the noise"
                 return _better(left, over_s, before_px2 - noise_px2)
-        for measured_px2, before_px2, _, over_s, _ in known[:1]:
-            if measured_px2 > MOST_MEASURED**2 * before_px2:
+            if measured_px2 > most_measured**2 * before_px2:
                 left = f"leaves {math.sqrt(measured_px2):.4f} px on frames"
                 return _better(left, over_s, before_px2)
         return ""

@@ -322,10 +322,10 @@ def test_a_design_that_is_only_a_little_worse_is_left_too():
     """It was made for three times the noise, so it leaves a sixth more, which no quick look at frames shows."""
     night = Night("loops.right.vernier.controller=minimum-variance")
     night.report(design_json=TIMID, measured_px=0.02, learnt_camera_px=0.02)
-    night.simulation.run(20.0)
+    night.simulation.run(8.0)
     assert night.loop.controller == "learnt"
 
-    night.simulation.run(40.0)
+    night.simulation.run(30.0)
     _, back = night.changes()
     assert (back.source, back.target) == ("learnt", "minimum-variance")
     assert "the design before would have left" in back.reason

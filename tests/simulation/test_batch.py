@@ -487,7 +487,7 @@ def learns_at_once(monkeypatch):
     """A learner that reports after half a minute, and a loop that goes back seconds after a change."""
     monkeypatch.setattr("fitctl.learn.learner.FIRST_S", 25.0)
     monkeypatch.setattr("fitctl.learn.learner.EVERY_S", 10.0)
-    monkeypatch.setattr("fitctl.loop.comparison.ON_PAPER", ((2.0, 0.1),))
+    monkeypatch.setattr("fitctl.loop.comparison.WATCHES", ((2.0, 0.1, 1.1),))
 
 
 SIX_HZ = (
