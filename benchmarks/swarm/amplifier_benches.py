@@ -30,7 +30,7 @@ class Motors:
         self._time = time
         self._angle_rad = [7.0, -11.0]
         self._velocity_rad_s = (0.0, 0.0)
-        self.enabled = [False, False]
+        self._enabled = [False, False]
         self.had_power = [Course(), Course()]
         for course in self.had_power:
             course.add(time.now_s, False)
@@ -40,7 +40,7 @@ class Motors:
         """Both angles."""
         now_s = self._time.now_s
         for axis, velocity in enumerate(self._velocity_rad_s):
-            self._angle_rad[axis] += velocity * (now_s - self._at_s) * self.enabled[axis]
+            self._angle_rad[axis] += velocity * (now_s - self._at_s) * self._enabled[axis]
         self._at_s = now_s
         az_rad, el_rad = self._angle_rad
         return az_rad, el_rad
@@ -53,7 +53,7 @@ class Motors:
     def set_enabled(self, axis: int, enabled: bool) -> None:
         """Switch the current on or off."""
         self.position_rad()
-        self.enabled[axis] = enabled
+        self._enabled[axis] = enabled
         self.had_power[axis].add(self._time.now_s, enabled)
 
 

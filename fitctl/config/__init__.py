@@ -34,6 +34,7 @@ from fitctl.config.loops import (
     Logging,
     Loop,
     LqgLtr,
+    OtherSpot,
     Vernier,
 )
 from fitctl.config.metrology import BeamSensor, MetrologyLoop
@@ -115,6 +116,7 @@ __all__ = [
     "MetrologyPlant",
     "ModbusDacDevice",
     "Motion",
+    "OtherSpot",
     "Range",
     "ResetBy",
     "Rig",

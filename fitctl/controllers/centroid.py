@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import HALF_WINDOW_PX, Camera, Loop
+from fitctl.config import HALF_WINDOW_PX, Camera, Loop, OtherSpot
 from fitctl.controllers.dark import Dark
-from fitctl.controllers.spot_fit import SpotFit, SpotPlace, spot_fit
+from fitctl.controllers.spot_fit import SpotFit, spot_fit
 from fitctl.model.compiled import compilable
 from fitctl.model.image.light import centroid_noise_px, light_below
 
@@ -212,29 +212,14 @@ class StarSensor:
         without = self._dark.without_measurement(image, top, left, side, side)
         place = self.fit.place(light_dn, az_px, el_px, without)
         if place is not None and self.near_spots:
-            light_dn -= self._near_light(place, az, el)
+            star = (az + place.az_px, el + place.el_px, place.flux_dn)
+            for spot in moving_with_star(self._loop, self.near_spots, *star):
+                light_dn -= spot_light(spot, az, el)
             place = self.fit.place(light_dn, place.az_px, place.el_px, without)
         if place is None:
             return None
         az_px, el_px, _, az_sigma_px, el_sigma_px = place
         return Star(az + az_px, el + el_px, flux_dn, az, el, az_sigma_px, el_sigma_px)
-
-    def _near_light(
-        self, star: SpotPlace, window_az_px: int, window_el_px: int
-    ) -> NDArray[np.float64]:
-        """What the loop's own near spots leave in a window, with its star at a place in it, shape (7, 7)."""
-        az_px, el_px = window_az_px + star.az_px, window_el_px + star.el_px
-        part, diameter_px = star.flux_dn / self._loop.star_flux_dn, self._loop.spot_diameter_px
-        spots = (
-            OtherLight(
-                az_px + spot.offset_px.az,
-                el_px + spot.offset_px.el,
-                part * spot.flux_dn,
-                diameter_px,
-            )
-            for spot in self.near_spots
-        )
-        return np.sum([spot_light(spot, window_az_px, window_el_px) for spot in spots], axis=0)
 
     def _accepted(self, star: Star | None) -> Star | None:
         if star is None or not self.flux_low_dn <= star.flux_dn <= self.flux_high_dn:
@@ -265,6 +250,21 @@ def _noise_px(fit: SpotFit | None, camera: Camera, loop: Loop, star_flux_dn: flo
             camera, star_flux_dn, 2 * HALF_WINDOW_PX + 1, loop.spot_diameter_px
         )
     return fit.noise_px(star_flux_dn)
+
+
+def moving_with_star(
+    loop: Loop, spots: Iterable[OtherSpot], az_px: float, el_px: float, flux_dn: float
+) -> list[OtherLight]:
+    """Spots of a loop's `other_spots`, with its star at a place and of a flux."""
+    return [
+        OtherLight(
+            az_px + spot.offset_px.az,
+            el_px + spot.offset_px.el,
+            spot.flux_dn * flux_dn / loop.star_flux_dn,
+            loop.spot_diameter_px,
+        )
+        for spot in spots
+    ]
 
 
 def _reaches(away_az_px: float, away_el_px: float, diameter_px: float) -> bool:

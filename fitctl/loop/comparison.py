@@ -108,12 +108,13 @@ class Comparison:
     def why_back(self) -> str:
         """Why the design before is the better one; empty as long as it is not known to be."""
         counted = self._frames - self._settle_frames
+        worst_axis_px2 = self._means_px2.max(axis=2).tolist()
         for means_px2, over, (over_s, most_on_paper, most_measured) in zip(
-            self._means_px2, self._over_frames, WATCHES, strict=True
+            worst_axis_px2, self._over_frames, WATCHES, strict=True
         ):
             if counted < over:
                 break
-            measured_px2, before_px2, learnt_px2 = means_px2.max(axis=1).tolist()
+            measured_px2, before_px2, learnt_px2 = means_px2
             noise_px2 = min(self._noise_px2, MOST_NOISE * before_px2)
             if learnt_px2 - noise_px2 > most_on_paper**2 * (before_px2 - noise_px2):
                 left = f"would leave {math.sqrt(learnt_px2 - noise_px2):.4f} px besides the noise"

@@ -215,6 +215,14 @@ def test_photodiodes_are_at_the_end_of_their_range(time, plant, does):
 # ------------------------------------------------------------ whole runs
 
 
+def run_without_violation(rig, duration_s, happenings):
+    """The records of a run in which nothing is violated."""
+    records = []
+    plan = Plan(seed=1, rig=rig, settings=[], duration_s=duration_s, happenings=happenings)
+    assert run_plan(plan, records.append).violations == []
+    return records
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("device", "fault", "reason"),
@@ -227,20 +235,18 @@ def test_photodiodes_are_at_the_end_of_their_range(time, plant, does):
     ],
 )
 def test_a_wrong_value_leads_to_safe_and_violates_nothing(device, fault, reason):
-    reasons = []
-
-    def on_record(record):
-        if isinstance(record, ModeChange) and record.target == "SAFE":
-            reasons.append(record.reason)
-
     happenings = [
         Order(at_s=0.1, who="ada"),
         Order(at_s=2.0, who="ada"),  # the search moves the siderostat
         Strike(at_s=2.5, device=device, fault=fault, lasts_s=4.0, size=1.0),
     ]
-    plan = Plan(seed=1, rig="fit-mock.toml", settings=[], duration_s=8.0, happenings=happenings)
+    records = run_without_violation("fit-mock.toml", 8.0, happenings)
+    reasons = [
+        record.reason
+        for record in records
+        if isinstance(record, ModeChange) and record.target == "SAFE"
+    ]
 
-    assert run_plan(plan, on_record).violations == []
     assert reason in reasons[0]
 
 
@@ -254,9 +260,8 @@ def test_a_sensor_with_wrong_values_violates_nothing(device):
             for number, fault in enumerate(WRONG[kind_of(device)])
         ],
     ]
-    plan = Plan(seed=1, rig="fit-testbed.toml", settings=[], duration_s=70.0, happenings=happenings)
 
-    assert run_plan(plan).violations == []
+    run_without_violation("fit-testbed.toml", 70.0, happenings)
 
 
 @pytest.mark.long
@@ -265,20 +270,18 @@ def test_a_sensor_with_wrong_values_violates_nothing(device):
     [("offset", "of its course"), ("stuck", "of its course"), ("servos off", "servos that are on")],
 )
 def test_a_hexapod_that_goes_wrong_under_way_violates_nothing(fault, reported):
-    errors = []
-
-    def on_record(record):
-        if isinstance(record, Event) and record.severity == "error":
-            errors.append(record.message)
-
     happenings = [
         Order(at_s=0.1, who="ada"),
         Order(at_s=2.0, who="ada", command=MoveCollector(action="reference")),
         Order(at_s=12.0, who="ada", command=MoveCollector(action="start")),
         Strike(at_s=14.0, device="hexapod", fault=fault, lasts_s=9.0),
     ]
-    plan = Plan(seed=1, rig="fit-testbed.toml", settings=[], duration_s=30.0, happenings=happenings)
+    records = run_without_violation("fit-testbed.toml", 30.0, happenings)
+    errors = [
+        record.message
+        for record in records
+        if isinstance(record, Event) and record.severity == "error"
+    ]
 
-    assert run_plan(plan, on_record).violations == []
     assert len(errors) == 1
     assert reported in errors[0]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Rig
-from fitctl.controllers.centroid import OtherLight, Star, StarSensor
+from fitctl.controllers.centroid import OtherLight, Star, StarSensor, moving_with_star
 from fitctl.controllers.estimator import StarEstimator
 from fitctl.logging.records import Severity
 from fitctl.loop.search.attribution import Attribution
@@ -57,9 +57,7 @@ class StarFinder:
         self.last: Star | None = None
         self._visible = False
         self._sensor = StarSensor(rig.camera, loop)
-        self._other_spots = loop.other_spots
-        self._star_flux_dn = loop.star_flux_dn
-        self._diameter_px = loop.spot_diameter_px
+        self._loop = loop
         self._report_event = report_event
 
     def expect_flux(self, flux_dn: float) -> None:
@@ -93,16 +91,8 @@ class StarFinder:
         az_px, el_px = az_px + moved_px[0], el_px + moved_px[1]
         flux_dn *= self._visible
         return [
-            OtherLight(az_px, el_px, flux_dn, self._diameter_px),
-            *(
-                OtherLight(
-                    az_px + spot.offset_px.az,
-                    el_px + spot.offset_px.el,
-                    spot.flux_dn * flux_dn / self._star_flux_dn,
-                    self._diameter_px,
-                )
-                for spot in self._other_spots
-            ),
+            OtherLight(az_px, el_px, flux_dn, self._loop.spot_diameter_px),
+            *moving_with_star(self._loop, self._loop.other_spots, az_px, el_px, flux_dn),
         ]
 
     def find(
