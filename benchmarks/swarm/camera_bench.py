@@ -81,8 +81,9 @@ class CameraBench:
             self._restart,
             self._registers,
             self._heartbeat,
+            self._rate,
         ]
-        self._beats = 0
+        self._beats = self._rates = 0
         self._last: tuple[int, Frame, CameraCounts] | None = None
         self._healed = 0
         self._first = 0
@@ -172,6 +173,17 @@ class CameraBench:
         got_ms = round(1000 * self._mock._parts()[2].heartbeat_s)
         if got_ms != value_ms and self.network.rebooted_s == math.inf:
             msg = f"heartbeat set to {value_ms} ms, is {got_ms} ms"
+            raise Mistaken(msg)
+
+    def _rate(self) -> None:
+        """Change the frame rate while frames come; the camera must then have it."""
+        self._rates += 1
+        rate_hz = self._settings.frame_rate_hz * (1.0, 0.96, 0.94)[self._rates % 3]
+        self.driver.set_frame_rate(rate_hz)
+        registers = self._mock._parts()[2]
+        got_hz = registers.double(Feature.FRAME_RATE_HZ)
+        if got_hz != rate_hz and self.network.rebooted_s == math.inf:
+            msg = f"frame rate set to {rate_hz:g} Hz, is {got_hz:g} Hz"
             raise Mistaken(msg)
 
     def _channel(self) -> ControlChannel:

@@ -12,6 +12,7 @@ from benchmarks.swarm.lines import FAULTS, WRONG, drawn_slowness
 from fitctl.messages.commands import (
     Acquire,
     AnyCommand,
+    FrameRate,
     Jog,
     Look,
     MoveCollector,
@@ -63,6 +64,7 @@ _FAST_FRAMES = (
 _FAST = {"fit-mock.toml": 0.1}
 """Fraction of runs with ten times as many frames; they last a third as long."""
 DURATION_S, FAST_DURATION_S = 120.0, 40.0
+MOST_RATE_S = 30.0  # of the camera at another rate
 OPERATORS = ("ada", "ben", "cleo", "dora")
 _OF_ONE_LOOP = 0.3  # fraction of commands that name a loop
 _WITHOUT_FAULTS = 0.15  # fraction of runs without device faults
@@ -248,6 +250,10 @@ _COMMANDS: dict[str, Callable[[Random], AnyCommand | None]] = {
     ),
     "bias-offset": lambda random: SetBiasOffset(
         az_urad=random.uniform(-100, 100), el_urad=random.uniform(-100, 100)
+    ),
+    "frame-rate": lambda random: FrameRate(
+        rate_hz=random.choice((47.0, 48.0, 470.0, 480.0)),
+        duration_s=random.uniform(1.0, MOST_RATE_S),
     ),
 }
 """By name. ``None`` stands for the command that brings a loop closer to its star."""

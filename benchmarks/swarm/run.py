@@ -25,6 +25,7 @@ from benchmarks.swarm.devices.sensors import SwarmCamera, SwarmPhotodiodes
 from benchmarks.swarm.invariants import Invariants, Violation
 from benchmarks.swarm.lines import FAULTS, Bus, Line
 from benchmarks.swarm.plan import (
+    MOST_RATE_S,
     ClockStep,
     Cloud,
     FullDisk,
@@ -617,6 +618,12 @@ def _recover(instrument: Instrument) -> None:
     else:
         modes = ", ".join(f"{name} {loop.mode.name}" for name, loop in loops.items())
         instrument.invariants.violated(f"healed, every star is held within {HEAL_S:g} s", modes)
+    if instrument.camera.at_other_rate:
+        time.run_until(time.now_s() + MOST_RATE_S + 1.0)
+        if instrument.camera.at_other_rate:
+            instrument.invariants.violated(
+                "the camera runs as the rig file says again", "it does not"
+            )
     now_s = time.now_s()
     for each in instrument.supervisor.loops.values():
         for outcome in instrument.supervisor.outcomes.add_to(each.state(now_s)).outcomes:

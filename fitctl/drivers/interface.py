@@ -139,6 +139,14 @@ class CameraDriver(Protocol):
         """
         ...
 
+    def set_frame_rate(self, rate_hz: float) -> None:
+        """Take frames at another rate from now on; also while another thread waits for one.
+
+        The rate of the rig file is in force again once the camera is opened anew. After DeviceRefused, the
+        camera keeps the rate that it has; after any other error, the rate is not known for sure.
+        """
+        ...
+
     def counts(self) -> CameraCounts:
         """Frames and losses so far; may be called from any thread."""
         ...

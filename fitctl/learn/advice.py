@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,6 +30,13 @@ from fitctl.learn.aliases import (
     can_be_alias,
     expecting,
     safe_parts,
+)
+from fitctl.learn.frame_rates import (
+    WORTH_TELLING,
+    AtOtherRate,
+    Told,
+    rate_to_tell,
+    tell,
 )
 from fitctl.learn.intervals import Interval
 from fitctl.learn.night import LearntLine, Night, estimate
@@ -65,7 +73,9 @@ class LineAdvice(NamedTuple):
     part : float
         Of the line's RMS that the learnt design expects: 1 counteracts the line in full, 0 leaves it alone.
     can_be_alias : bool
-        The rig may have vibrations as fast as its aliases.
+        The rig may have vibrations as fast as its aliases, and no other frame rate has shown that it is none.
+    is_alias : bool or None
+        What another frame rate has shown; None without one.
     if_alias : IfAliases
         Residual of both designs if the line is one of its aliases.
     """
@@ -73,12 +83,18 @@ class LineAdvice(NamedTuple):
     found: LearntLine
     part: float
     can_be_alias: bool
+    is_alias: bool | None
     if_alias: IfAliases
 
     @property
     def counteracted(self) -> bool:
         """At least in part."""
         return self.part > 0
+
+    @property
+    def is_open(self) -> bool:
+        """It would be counteracted further if it were known to be no alias."""
+        return self.can_be_alias and self.part < 1 and self.is_alias is None
 
     @property
     def how_far(self) -> str:
@@ -131,6 +147,8 @@ class Advice(NamedTuple):
         The same without lines.
     filled : int
         Frames that are missing, or that a late command met.
+    period_s : float
+        Of frames.
     """
 
     night: Night
@@ -146,6 +164,7 @@ class Advice(NamedTuple):
     shown_px: tuple[float, float]
     without_lines_px: tuple[float, float]
     filled: int
+    period_s: float
 
     @property
     def worth_it(self) -> bool:
@@ -186,6 +205,24 @@ class Advice(NamedTuple):
     def _better_lately(self) -> bool:
         present_px, learnt_px = self.lately_px
         return learnt_px <= self._allowed(BETTER_LATELY) * present_px
+
+    @property
+    def rate_to_tell_hz(self) -> float:
+        """The frame rate that would tell lines from aliases, if that is worth it; otherwise 0."""
+        least_px = min(self.present.residual_px, self.learnt.residual_px)
+        open_hz = [line.found.frequency_hz.value for line in self.lines if line.is_open]
+        if not open_hz or least_px < WORTH_TELLING * self.bound_px:
+            return 0.0
+        return rate_to_tell(open_hz, 1 / self.period_s)
+
+    @property
+    def told(self) -> list[Told]:
+        """The lines of which another frame rate has shown whether they are aliases."""
+        return [
+            Told(line.found.frequency_hz.value, line.is_alias)
+            for line in self.lines
+            if line.is_alias is not None
+        ]
 
     def lines_of_text(self) -> list[str]:
         """For an operator."""
@@ -253,12 +290,18 @@ class Advice(NamedTuple):
 
     def _alias_hint(self) -> list[str]:
         """Tells an operator who knows the rig's vibrations how to have such lines counteracted in full."""
-        if not any(line.can_be_alias and line.part < 1 for line in self.lines):
+        if not any(line.is_open for line in self.lines):
             return []
-        return [
+        text = [
             "             if you know how fast vibrations are at most, set fastest_line_hz: lines that are "
             "then no aliases are counteracted in full"
         ]
+        if self.rate_to_tell_hz:
+            text.append(
+                "             another frame rate shows which they are, while the star is held: "
+                f"fitctl send frame-rate {self.rate_to_tell_hz:g}"
+            )
+        return text
 
     def _more_writes_hint(self) -> list[str]:
         """Tells an operator how much the hold between frames costs."""
@@ -314,6 +357,8 @@ def advise(
     present: Design,
     required: Required | None = None,
     like: Design | None = None,
+    known: Sequence[Told] = (),
+    others: Sequence[AtOtherRate] = (),
 ) -> Advice:
     """Estimate a night and design for it.
 
@@ -331,13 +376,18 @@ def advise(
         Margins of the learnt design.
     like : Design, optional
         That was learnt from nearly the same frames: the search begins there.
+    known : sequence of Told
+        What was told of lines before.
+    others : sequence of AtOtherRate
+        The loop, opened, at other frame rates.
 
     Raises
     ------
     ConfigError
         If there is too little of it, or no design has the margins.
     """
-    night, truth = estimated(series, rig_basis)
+    night, truth, told = estimated(series, rig_basis, known, others)
+    is_alias = dict(told)
     suspects = tuple(line for line in truth.lines if can_be_alias(line, truth))
     present_stands = standing(present, truth)
     gain = _gain_for_aliases(night)
@@ -362,6 +412,7 @@ def advise(
                 found,
                 part,
                 line in suspects,
+                is_alias.get(found.frequency_hz.value),
                 both_if_aliases(present, design, truth, (line,), gain),
             )
             for found, line, part in zip(night.lines, truth.lines, parts, strict=True)
@@ -372,6 +423,7 @@ def advise(
         shown_px=_left(present, design, shown),
         without_lines_px=_left(present, design, dataclasses.replace(shown, lines=())),
         filled=sum(one.filled for one in series),
+        period_s=truth.period_s,
     )
 
 
@@ -380,8 +432,13 @@ def _left(present: Design, learnt: Design, truth: Basis) -> tuple[float, float]:
     return linear_residual(present, truth), linear_residual(learnt, truth)
 
 
-def estimated(series: list[Series], rig_basis: Basis) -> tuple[Night, Basis]:
-    """Estimate a night, and what designs count with if that is what it was like.
+def estimated(
+    series: list[Series],
+    rig_basis: Basis,
+    known: Sequence[Told] = (),
+    others: Sequence[AtOtherRate] = (),
+) -> tuple[Night, Basis, list[Told]]:
+    """Estimate a night, what designs count with if that is what it was like, and which lines are aliases.
 
     Arguments as of :func:`advise`.
 
@@ -399,6 +456,10 @@ def estimated(series: list[Series], rig_basis: Basis) -> tuple[Night, Basis]:
         )
         raise ConfigError(msg)
     night = estimate(opened, rig_basis.air_path, rig_basis.noise_px)
+    suspects = [line for line in night.lines if can_be_alias(line.for_design, rig_basis)]
+    told = tell(night, suspects, 1 / rig_basis.period_s, known, others)
+    slow_hz = tuple(one.frequency_hz for one in told if not one.is_alias)
+    rig_basis = dataclasses.replace(rig_basis, slow_lines_hz=slow_hz)
     truth = dataclasses.replace(
         rig_basis,
         noise_px=night.noise_px.value,
@@ -407,7 +468,7 @@ def estimated(series: list[Series], rig_basis: Basis) -> tuple[Night, Basis]:
         mirror_gain=_gain_for_design(night, rig_basis),
         overshoot=_overshoot_for_design(night),
     )
-    return night, truth
+    return night, truth, told
 
 
 def _lately_px(
@@ -503,6 +564,8 @@ def _line_text(line: LineAdvice) -> str:
     done = f"; {line.how_far}" if line.how_far else ""
     if 0 < line.part < 1:
         done += f", as {line.part:.0%} of its RMS"
+    if line.is_alias is not None:
+        done += f"; another frame rate showed that it is {'an' if line.is_alias else 'no'} alias"
     if_alias = (
         f"\n             if it is at {fast} Hz instead: present {line.if_alias.present_px:.4f}, "
         f"learnt {line.if_alias.learnt_px:.4f} px"
@@ -537,6 +600,7 @@ def _line_numbers(line: LineAdvice) -> dict[str, Any]:
         "counteracted": line.counteracted,
         "part": line.part,
         "can_be_alias": line.can_be_alias,
+        "is_alias": line.is_alias,
         "residual_if_alias_px": {
             "present": line.if_alias.present_px,
             "learnt": line.if_alias.learnt_px,

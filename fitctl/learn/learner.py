@@ -20,6 +20,7 @@ from fitctl.controllers.design.theory import loop_theory
 from fitctl.controllers.pair import Design
 from fitctl.error_budget import pieces_of
 from fitctl.learn.advice import Advice, advise
+from fitctl.learn.frame_rates import AtOtherRate, Told, by_rate
 from fitctl.learn.opened import LEAST_S, rebuild
 from fitctl.logging.records import Tick
 from fitctl.loop.learning import has_moved
@@ -90,6 +91,7 @@ class Learner:
         self._design = ""
         self._since_s = 0.0
         self._learnt: Design | None = None  # last
+        self._told: list[Told] = []
 
     def watch(self, design: str, now_s: float) -> None:
         """The design in force now, by its key."""
@@ -153,6 +155,7 @@ class Learner:
         table = np.roll(self._ring[: self.frames], -oldest, axis=0)
         ticks = dict(zip(_KEPT, table.T, strict=True))
         pieces = pieces_of(ticks["mid_exposure_s"], np.ones(len(table), bool))
+        pieces, others = by_rate(ticks["mid_exposure_s"], pieces, self._period_s)
         theory = loop_theory(self._rig, self._loop_name, present)
         error_px = np.stack([ticks["error_az_px"], ticks["error_el_px"]], axis=-1)
         own = error_px[ticks["time_s"] >= self._since_s + SETTLE_S]
@@ -167,8 +170,10 @@ class Learner:
             basis(self._rig, self._loop_name),
             present,
             like=self._learnt,
+            known=self._told,
+            others=[AtOtherRate(s, rebuild(theory, ticks, [rows])) for s, rows in others],
         )
-        self._learnt = advice.design
+        self._learnt, self._told = advice.design, advice.told
         if math.isinf(advice.present.residual_px):
             msg = (
                 f"learn: the mirror moves by {advice.night.mirror_gain} of what the rig file predicts, and the "
@@ -191,6 +196,7 @@ class Learner:
             noise_px=advice.night.noise_px.value,
             worth_it=advice.worth_it,
             fits=advice.night.test.fits,
+            rate_to_tell_hz=advice.rate_to_tell_hz,
         )
 
 

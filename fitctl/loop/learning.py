@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from fitctl.config import Rig
 from fitctl.controllers.pair import Design, Measurement
 from fitctl.loop.comparison import Comparison, comparison
+from fitctl.loop.frame_rate import RateWatch
 from fitctl.messages.commands import LearnerReport
 from fitctl.messages.telemetry import LearningState
 from fitctl.model.optics import AzEl
@@ -57,6 +58,7 @@ class Learning:
         self._loop_name = loop_name
         self._comparison: Comparison | None = None
         self._period_s = rig.camera.period_s
+        self._frame_rate = RateWatch(rig.camera.period_s)
         self._longest_gap_s = _LONGEST_GAP * rig.camera.period_s
         self._last_s = math.inf
         self._keep = [math.exp(-rig.camera.period_s / over_s) for over_s, _ in _WATCHES]
@@ -99,13 +101,15 @@ class Learning:
         """Whether the design that was learnt last is to be made and used, without being asked."""
         report = self.report
         return (
-            self.setting == "on"
-            and not self._by_hand
+            self.may_act(now_s)
             and report is not None
             and report.worth_it
             and now_s >= self._paused_until_s
-            and self.is_calm(now_s)
         )
+
+    def may_act(self, now_s: float) -> bool:
+        """Whether anything is to be done for the learner now, without being asked."""
+        return self.setting == "on" and not self._by_hand and self.is_calm(now_s)
 
     def is_calm(self, now_s: float) -> bool:
         """Nothing hinders a change of design: see `CALM_S`."""
@@ -175,6 +179,7 @@ class Learning:
     def observe(
         self,
         now_s: float,
+        exposed_s: float,
         error_px: AzEl | None,
         target_px: AzEl,
         stages_rad: tuple[Floats, Floats],
@@ -186,6 +191,8 @@ class Learning:
 
         Parameters
         ----------
+        exposed_s : float
+            Of mid-exposure. Nothing is compared or changed while the camera runs at another rate.
         error_px : tuple of float or None
             None without a star.
         target_px : tuple of float
@@ -198,6 +205,7 @@ class Learning:
         hindered : bool
             The loop is not in VERNIER, waits, or an interlock keeps the stages from following the star.
         """
+        hindered = self._frame_rate.is_other(exposed_s) or hindered
         moved = has_moved(target_px, self._last_target_px, self._period_s)
         self._last_target_px = target_px
         if now_s - self._last_s > self._longest_gap_s:

@@ -268,6 +268,7 @@ class StellarLoop(Loop):
         target_px = self.pointing.command_px
         why_back = self.learning.observe(
             observation.now_s,
+            frame.mid_exposure_s,
             None if star is None else error_from(target_px, star),
             target_px,
             (observation.law_mirror_rad, observation.beam_rad),

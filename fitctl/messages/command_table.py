@@ -109,6 +109,7 @@ COMMANDS = (
     CommandRow(commands.SetController, "the instrument", "controller", wait_s=120.0),
     CommandRow(commands.Reset, "the instrument", "reset"),
     CommandRow(commands.MoveCollector, "the instrument", "collector"),
+    CommandRow(commands.FrameRate, "the instrument", "frame-rate"),
     CommandRow(commands.Status, "any key", "status", logged=False),
     CommandRow(commands.RecentEvents, "any key", "events", logged=False),
     CommandRow(commands.TakeOver, "a commander's key", "take-over"),

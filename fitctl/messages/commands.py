@@ -141,6 +141,16 @@ class MoveCollector(Command, frozen=True, kw_only=True):
         return {name: v for name, v in given.items() if name not in common and v is not None}
 
 
+class FrameRate(Command, frozen=True, kw_only=True):
+    """Run the camera slower for a while, so that vibrations can be told from their aliases.
+
+    Then it runs as the rig file says again.
+    """
+
+    rate_hz: float
+    duration_s: float = 30.0
+
+
 class Experiment(Command, frozen=True, kw_only=True):
     """From COARSE or VERNIER: make motions with one loop's stages, open loop, then return to COARSE."""
 
@@ -194,6 +204,8 @@ class LearnerReport(Command, frozen=True, kw_only=True):
         The learnt design leaves clearly less; much less where the model does not fit the frames.
     fits : bool
         The model fits the frames.
+    rate_to_tell_hz : float
+        The frame rate at which lines could be told from aliases, where that is worth it.
     """
 
     design_json: str
@@ -207,6 +219,7 @@ class LearnerReport(Command, frozen=True, kw_only=True):
     noise_px: float = 0.0
     worth_it: bool = False
     fits: bool = True
+    rate_to_tell_hz: float = 0.0
 
 
 class SequenceStatus(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -251,6 +264,7 @@ AnyCommand = (
     | SetController
     | Reset
     | MoveCollector
+    | FrameRate
     | Experiment
     | Status
     | RecentEvents

@@ -136,6 +136,9 @@ class LoggedCamera(NoDevice):
             raise self._error
         return self._frames.popleft() if self._frames else None
 
+    def set_frame_rate(self, rate_hz: float) -> None:
+        """The log has the frames as they came."""
+
     def counts(self) -> CameraCounts:
         """Nobody decides by them."""
         return CameraCounts(0, 0, 0)

@@ -64,8 +64,8 @@ from fitctl.stages.siderostat import SiderostatStage
 from fitctl.supervisor.supervisor import Supervisor
 
 # Who commands is not replayed; a sequence leads to commands of its own, which are in the log as well. What a
-# collector that moves does to the stars and the beam is in what was measured.
-_NOT_REPLAYED = {"SequenceControl", "TakeOver", "MoveCollector"}
+# collector that moves does to the stars and the beam is in what was measured, and when frames came is logged.
+_NOT_REPLAYED = {"SequenceControl", "TakeOver", "MoveCollector", "FrameRate"}
 _RENAMED = {"Hold": "Release"}  # commands of older logs
 _OF_CONTROLLERS = {"SetController", "LearnerReport"}
 

@@ -302,6 +302,7 @@ class SimulatedCamera:
         self._exposures = 0  # never starts again, as the frames' numbers do: noise must not repeat
         self._frames = 0
         self._start_s = 0.0
+        self._period_s = self._camera.period_s
         self._due: list[tuple[float, int]] = []  # a heap: when, and which
 
     def open(self) -> DeviceIdentity:
@@ -311,6 +312,7 @@ class SimulatedCamera:
     def start(self) -> None:
         """The first exposure begins now."""
         self._frames = 0
+        self._period_s = self._camera.period_s
         self._start_s = self._clock.now_s() + self._camera.exposure_s / 2
         now_s = self._clock.now_s()
         self._due = [(now_s + work[0], which) for which, work in enumerate(self.on_servo_period)]
@@ -318,7 +320,7 @@ class SimulatedCamera:
 
     def next_frame(self, timeout_s: float) -> Frame | None:
         """Go on to the next frame's arrival, or by `timeout_s`."""
-        exposed_s = self._start_s + self._frames * self._camera.period_s
+        exposed_s = self._start_s + self._frames * self._period_s
         arrives_s = exposed_s + self._camera.frame_delay_s
         now_s = self._clock.now_s()
         if arrives_s > now_s + timeout_s + 1e-9:
@@ -332,6 +334,13 @@ class SimulatedCamera:
         noise_dn = self._plant.pixel_noise_dn(exposed_s)
         image = self._scene.frame(spots, self._pixel_key, self._exposures, noise_dn)
         return Frame(self._frames, exposed_s, self._clock.now_s(), image)
+
+    def set_frame_rate(self, rate_hz: float) -> None:
+        """Expose a new period after the last frame, and so on."""
+        last = self._frames - 1
+        self._start_s += last * self._period_s
+        self._period_s = 1 / rate_hz
+        self._start_s -= last * self._period_s
 
     def counts(self) -> CameraCounts:
         """Nothing is ever lost here."""

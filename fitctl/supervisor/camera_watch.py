@@ -31,6 +31,8 @@ class CameraWatch:
         That came with the newest frame: it is acted on, they are not.
     skipped : int
         How many those were, since the camera was opened.
+    opened : int
+        How often it was.
     """
 
     def __init__(
@@ -39,6 +41,7 @@ class CameraWatch:
         self.ready = False
         self.older: list[Frame] = []
         self.skipped = 0
+        self.opened = 0
         self._period_s = rig.camera.period_s
         self._silent_after_s = rig.camera.frame_delay_s + _SILENT_FRAMES * self._period_s
         self._camera = camera
@@ -46,10 +49,11 @@ class CameraWatch:
         self._failed = failed
         self._last_frame_s = clock.now_s()
 
-    def begin(self) -> None:
-        """It was opened just now."""
+    def begin(self, *, opened: bool) -> None:
+        """Devices were opened just now, and perhaps it among them; otherwise it should still be well."""
         self.ready = True
         self.skipped = 0
+        self.opened += opened
         self._last_frame_s = self._clock.now_s()
 
     def next_frame(self, meanwhile: Callable[[], float]) -> Frame | None:
@@ -71,7 +75,6 @@ class CameraWatch:
                 self.older.append(frame)
                 frame = newer
         except DeviceError as error:
-            self.ready = False
             if frame is not None:
                 self.older.append(frame)
             self._failed(error)

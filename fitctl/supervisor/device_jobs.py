@@ -162,7 +162,7 @@ class DeviceJobs:
             return
         opened: Opened = future.result()
         self.identities.update(opened.identities)
-        self._camera.begin()
+        self._camera.begin(opened=with_camera)
         for name in names:
             loop = self._loops[name]
             loop.begin(opened.stack_v.get(name))

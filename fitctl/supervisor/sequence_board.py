@@ -41,6 +41,12 @@ class SequenceBoard:
         silent = self._clock.now_s() - self._heard_s > SILENCE_S
         return None if silent else self._status
 
+    @property
+    def under_way(self) -> bool:
+        """A sequence is running or paused."""
+        status = self.status()
+        return status is not None and status.state in _UNDER_WAY
+
     def report(self, status: SequenceStatus) -> Reply:
         """Take a sequence's word, unless another is under way."""
         known = self.status()

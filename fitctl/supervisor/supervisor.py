@@ -13,14 +13,14 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor
 from contextlib import suppress
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 
 from fitctl.clock import Clock
 from fitctl.config import Rig
 from fitctl.controllers.pair import Designer
-from fitctl.drivers.interface import DeviceError, Devices, Frame, LoopDevices
+from fitctl.drivers.interface import Devices, Frame, LoopDevices
 from fitctl.logging.records import (
     CAMERA,
     AnyRecord,
@@ -40,6 +40,8 @@ from fitctl.messages.command_table import ROWS, command_record
 from fitctl.messages.commands import (
     Acquire,
     AnyCommand,
+    Experiment,
+    FrameRate,
     LearnerReport,
     MoveCollector,
     Off,
@@ -61,6 +63,7 @@ from fitctl.supervisor.camera_watch import CameraWatch
 from fitctl.supervisor.collector import CollectorWatch
 from fitctl.supervisor.design_jobs import DesignJobs
 from fitctl.supervisor.device_jobs import DeviceJobs
+from fitctl.supervisor.frame_rate import FrameRateChange
 from fitctl.supervisor.health import (
     camera_health,
     hexapod_health,
@@ -182,11 +185,18 @@ class Supervisor:
         self._device_jobs = DeviceJobs(
             devices, self.loops, self.piezos, self._camera, executor, journal
         )
+        self._frame_rate = FrameRateChange(
+            rig, devices.camera, self._camera, executor, journal, self._camera_failed
+        )
         self.collector = (
             CollectorWatch(rig.collector, devices.hexapod, clock, self.report_event)
             if rig.collector is not None and devices.hexapod is not None
             else None
         )
+        self._rig_commands: dict[type[AnyCommand], Callable[[Any], str]] = {
+            MoveCollector: self._move_collector,
+            FrameRate: self._change_frame_rate,
+        }
         self._timing = TimingBook(clock, rig, self._timed)
         self._servo_groups = servo_groups(devices, self.servos, clock)
 
@@ -269,6 +279,7 @@ class Supervisor:
         frame = self._camera.next_frame(self._write_due)
         self._finish_jobs()
         self._obey_posted()
+        self._frame_rate.check()
         self._record_left()
         lost = self._camera.counts.lost if self._camera.ready else 0
         loops = self._in_order
@@ -350,7 +361,8 @@ class Supervisor:
         if self.collector is not None:
             self.collector.stop()
 
-    def _camera_failed(self, error: DeviceError) -> None:
+    def _camera_failed(self, error: Exception) -> None:
+        self._camera.ready = False
         for loop in self.stellar_loops.values():
             loop.device_failed(CAMERA, error)
 
@@ -415,18 +427,31 @@ class Supervisor:
                 return self.sequences.control(command.action)
             case _ if type(command) in _COMMANDS:
                 return self._fire(_COMMANDS[type(command)], names, command)
-            case MoveCollector():
-                return self._move_collector(command)
+            case _ if type(command) in self._rig_commands:
+                why_not = self._rig_commands[type(command)](command)
+                return _refusal(why_not) if why_not else Reply(accepted=True)
             case _ if type(command) in LOOP_COMMANDS:
                 why_not = obey_loop_command(self.rig, [self.loops[name] for name in names], command)
+                if isinstance(command, Experiment) and not why_not:
+                    self._frame_rate.end()
             case _:
                 why_not = f"{type(command).__name__} is not for the supervisor"
         return _refusal(why_not) if why_not else self._begin(command, names)
 
-    def _move_collector(self, command: MoveCollector) -> Reply:
-        collector, none = self.collector, "the rig has no collector that moves"
-        why_not = none if collector is None else collector.obey(command)
-        return _refusal(why_not) if why_not else Reply(accepted=True)
+    def _move_collector(self, command: MoveCollector) -> str:
+        if self.collector is None:
+            return "the rig has no collector that moves"
+        return self.collector.obey(command)
+
+    def _change_frame_rate(self, command: FrameRate) -> str:
+        if self._device_jobs.busy:
+            return "devices are being opened or closed; wait for the event that reports the end"
+        if any(loop.mode is Mode.EXPERIMENT for loop in self.loops.values()):
+            return "an experiment needs the rig's frame rate; wait for its end"
+        why_not = self._frame_rate.why_not(command.rate_hz, command.duration_s)
+        if not why_not:
+            self._frame_rate.begin(command.rate_hz, command.duration_s)
+        return why_not
 
     def _fire(self, trigger: Trigger, names: list[str], command: AnyCommand) -> Reply:
         if isinstance(command, Acquire):
@@ -484,6 +509,9 @@ class Supervisor:
         if why_not:
             return _refusal(why_not)
         self._design_jobs.learn(loop, report)
+        occupied = self._device_jobs.busy or self.sequences.under_way
+        if not occupied and loop.learning.may_act(self._clock.now_s()):
+            self._frame_rate.for_learner(report.rate_to_tell_hz)
         return Reply(accepted=True)
 
     # ------------------------------------------------------------ beside the ticks

@@ -245,7 +245,7 @@ def test_a_driver_that_takes_any_answer_is_found(name):
 @pytest.mark.parametrize(
     ("mistake", "shows"),
     [
-        ("any answer", "register|identity|camera says|heartbeat set"),
+        ("any answer", "register|identity|camera says|heartbeat set|does not run"),
         ("packets of any frame", "is of several|is frame"),
         ("lost packets that are not counted", "0 lost packets counted"),
         ("a restart that is not noticed", "is not noticed"),

@@ -449,7 +449,9 @@ def test_a_gain_that_a_fast_line_could_imitate_is_left_to_the_margins(
 ):
     truth = dataclasses.replace(paper, lines=(SIX_HZ,))
     _, series = held(truth, fixed, TWO_MINUTES_S, 5, mirror_gain=0.73)
-    night, known = estimated([series], dataclasses.replace(paper, fastest_line_hz=fastest_line_hz))
+    night, known, _ = estimated(
+        [series], dataclasses.replace(paper, fastest_line_hz=fastest_line_hz)
+    )
 
     assert night.mirror_gain.value == pytest.approx(0.73, abs=0.05)
     assert known.mirror_gain == pytest.approx(gain, abs=0.05)

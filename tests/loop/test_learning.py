@@ -255,6 +255,15 @@ def test_while_the_target_moves_nothing_changes(shaken):
     assert len(shaken.changes()) == 1
 
 
+class RateStub:
+    """Whether frames come at another rate is set by the test."""
+
+    other = False
+
+    def is_other(self, _exposed_s):
+        return self.other
+
+
 @pytest.mark.parametrize(
     "hindrance",
     [
@@ -263,16 +272,20 @@ def test_while_the_target_moves_nothing_changes(shaken):
         {"target_px": (20.2, 20.0)},
         {"hindered": True},  # not in VERNIER, an experiment, or an interlock
         {"now_s": CALM_S + 1.0},  # after a gap
+        {"other_rate": True},
     ],
 )
 def test_nothing_changes_until_the_loop_has_been_calm_for_a_while(hindrance):
     learning = Learning(load_rig(default_rig_path(), ["loops.right.learn=on"]), "right")
     learning.accept(report())
     still = (np.zeros(2), np.zeros(2))
+    learning._frame_rate = rate = RateStub()
 
-    def observe(now_s, **values):
+    def observe(now_s, *, other_rate=False, **values):
+        rate.other = other_rate
         frame = {"error_px": (0.0, 0.0), "target_px": (20.0, 20.0), "stages_rad": still}
-        learning.observe(**frame | {"now_s": now_s, "saturated": False, "hindered": False} | values)
+        frame |= {"now_s": now_s, "exposed_s": now_s, "saturated": False, "hindered": False}
+        learning.observe(**frame | values)
         return learning.wants_change(now_s)
 
     calm = [observe(0.02 * n) for n in range(round(CALM_S / 0.02) + 10)]

@@ -38,7 +38,6 @@ class SwarmCamera(SimulatedCamera):
         device = rig.camera.device
         self.line = Line("camera", device.endpoint, time, random, 0.002, device.response_timeout_s)
         self._time = time
-        self._period_s = rig.camera.period_s
         self._random = random
         self._image: NDArray[Any] | None = None  # of the newest frame
         self._full_scale_dn = rig.camera.full_scale_dn
@@ -98,6 +97,16 @@ class SwarmCamera(SimulatedCamera):
         if "saturated" in self.line.wrong:
             image = np.full_like(image, self._full_scale_dn)
         return Frame(self._frames, exposed_s, self._time.now_s(), image)
+
+    def set_frame_rate(self, rate_hz: float) -> None:
+        """Take frames at another rate, if the camera answers."""
+        change = super().set_frame_rate
+        self.line.ask(lambda: change(rate_hz))
+
+    @property
+    def at_other_rate(self) -> bool:
+        """It does not take frames as often as the rig file says."""
+        return self._streams and self._period_s != self._camera.period_s
 
     def counts(self) -> CameraCounts:
         """Count the frames, and the lost ones."""

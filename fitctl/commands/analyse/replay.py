@@ -155,7 +155,7 @@ def _left(gathered: Gathered, name: str, asked: Rig) -> Left:
         loop = opened_loop(gathered, name)
         for held in held_by_controller(gathered, name, loop.selection):
             measured[held.controller] = (held.residual["az"].rms, held.residual["el"].rms)
-        _, truth = estimated(loop.series, basis(gathered.run.rig, name))
+        _, truth, _ = estimated(loop.series, basis(gathered.run.rig, name))
         designs = (loop.present, design_for(asked, name))
         found = {design.name: standing(design, truth) for design in designs}
     except ConfigError as error:

@@ -46,4 +46,10 @@ def learn(
 
 def _advice(run: Run, loop_name: str) -> Advice:
     loop = opened_loop(gather(run), loop_name)
-    return advise(loop.series, loop.measured_px, basis(run.rig, loop_name), loop.present)
+    return advise(
+        loop.series,
+        loop.measured_px,
+        basis(run.rig, loop_name),
+        loop.present,
+        others=loop.others,
+    )

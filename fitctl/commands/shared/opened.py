@@ -11,6 +11,7 @@ from fitctl.controllers.pair import Design
 from fitctl.error_budget import pieces_of
 from fitctl.figures.attenuation import mirror_at_exposure_rad
 from fitctl.identify.record import axis_pair
+from fitctl.learn.frame_rates import AtOtherRate, by_rate
 from fitctl.learn.opened import Series, rebuild
 from fitctl.report.gather import Gathered
 from fitctl.report.rejection import last_design
@@ -23,6 +24,8 @@ class OpenedLoop(NamedTuple):
     Attributes
     ----------
     series : list of Series
+    others : list of AtOtherRate
+        What was recorded at other frame rates than the rig file's.
     selection : Selection
         The frames of it; those at which the stages were held are no part of the series.
     measured_px : tuple of float
@@ -32,6 +35,7 @@ class OpenedLoop(NamedTuple):
     """
 
     series: list[Series]
+    others: list[AtOtherRate]
     selection: Selection
     measured_px: tuple[float, float]
     present: Design
@@ -52,12 +56,16 @@ def opened_loop(gathered: Gathered, loop_name: str) -> OpenedLoop:
     usable = np.zeros(len(ticks["held"]), bool)
     usable[selection.rows] = True
     usable &= ~ticks["held"]
-    series = rebuild(
-        loop_theory(rig, loop_name, present),
-        ticks,
-        pieces_of(ticks["mid_exposure_s"], usable),
-        mirror_at_exposure_rad(loop.fsm, ticks),
-    )
+    exposed_s = ticks["mid_exposure_s"]
+    pieces, others = by_rate(exposed_s, pieces_of(exposed_s, usable), rig.camera.period_s)
+    theory = loop_theory(rig, loop_name, present)
+    mirror_rad = mirror_at_exposure_rad(loop.fsm, ticks)
     error_px = axis_pair(ticks, "error_{}_px")[usable]
     az_px, el_px = np.sqrt(np.mean(error_px**2, axis=0)).tolist() if len(error_px) else (0.0, 0.0)
-    return OpenedLoop(series, selection, (az_px, el_px), present)
+    return OpenedLoop(
+        rebuild(theory, ticks, pieces, mirror_rad),
+        [AtOtherRate(s, rebuild(theory, ticks, [rows], mirror_rad)) for s, rows in others],
+        selection,
+        (az_px, el_px),
+        present,
+    )

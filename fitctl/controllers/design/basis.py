@@ -81,6 +81,8 @@ class Basis:
         rings; `fitctl design learn` measures it.
     fastest_line_hz : float
         No vibration is faster.
+    slow_lines_hz : tuple of float
+        Lines that are no aliases of faster ones, as another frame rate has shown.
     writes : int
         Of the D/A in a frame period, at equal intervals. Designs that do not predict use one.
     """
@@ -97,6 +99,7 @@ class Basis:
     mirror_gain: float = 1.0
     overshoot: float = 0.0
     fastest_line_hz: float = math.inf
+    slow_lines_hz: tuple[float, ...] = ()
     writes: int = 1
 
 

@@ -24,6 +24,7 @@ from fitctl.drivers.gige.features import (
     RATE_TOLERANCE,
     expect,
     mismatch,
+    refused_rate,
 )
 from fitctl.drivers.gige.gvcp import DEVICE
 from fitctl.drivers.gige.heartbeat import Heartbeat
@@ -151,6 +152,28 @@ class AravisCamera:
                     return frame
             elif left_s == 0.0:
                 return None
+
+    def set_frame_rate(self, rate_hz: float) -> None:
+        """Take frames at another rate from now on; also while another thread waits for one.
+
+        Raises
+        ------
+        DeviceUnreachable, DeviceTimeout
+            If the camera is closed, or no longer answers.
+        DeviceRefused
+            If the camera will not have this rate, and keeps the one it has.
+        DeviceMismatch
+            If it has taken another.
+        """
+        self._opened()
+        try:
+            with self._translated("another frame rate"):
+                self._device.set_frame_rate(rate_hz)
+        except DeviceMismatch as error:
+            raise refused_rate(self._endpoint, rate_hz, error.got) from error
+        with self._translated("the frame rate to be readable"):
+            actual_hz = self._device.get_frame_rate()
+        self._expect("frame rate", rate_hz, actual_hz, RATE_TOLERANCE)
 
     def counts(self) -> CameraCounts:
         """Frames and losses so far; may be called from any thread."""

@@ -142,6 +142,21 @@ class GigeCamera:
                 return None
             self._poll.poll(max(0.0, wake_s - now_s) * 1000)
 
+    def set_frame_rate(self, rate_hz: float) -> None:
+        """Take frames at another rate from now on; also while another thread waits for one.
+
+        Raises
+        ------
+        DeviceUnreachable, DeviceTimeout
+            If the camera is closed, or no longer answers.
+        DeviceRefused
+            If the camera will not have this rate, and keeps the one it has.
+        DeviceMismatch
+            If it has taken another.
+        """
+        _channel, features, _heartbeat = self._opened()
+        features.set_frame_rate(rate_hz)
+
     def counts(self) -> CameraCounts:
         """Frames and losses so far; may be called from any thread."""
         assembler = self._assembler

@@ -83,6 +83,7 @@ class Features:
             def is_open(self) -> bool:
                 return True
 
+        self._endpoint = channel.endpoint
         self._expect = partial(expect, channel.endpoint)
         self._mismatch = partial(mismatch, channel.endpoint)
         self._errors: type[Exception] = genapi.GenericException
@@ -125,6 +126,23 @@ class Features:
         self._expect("PayloadSize", payload_bytes, self.value("PayloadSize"), tolerance=0.0)
         self._set_gain(camera.device.gain)
         return self._set_timing(camera)
+
+    def set_frame_rate(self, rate_hz: float) -> None:
+        """Set the frame rate alone, also while frames are taken.
+
+        Raises
+        ------
+        DeviceRefused
+            If the camera will not have the value, and keeps the one it has.
+        DeviceMismatch
+            If it has taken another.
+        """
+        rate = self._needed(FRAME_RATE)
+        try:
+            self._set(rate, rate_hz)
+        except DeviceMismatch as error:
+            raise refused_rate(self._endpoint, rate_hz, error.got) from error
+        self._expect(rate, rate_hz, self.value(rate), RATE_TOLERANCE)
 
     def first_of(self, names: tuple[str, ...]) -> str | None:
         """Which of a feature's names the camera knows; None where it knows none."""
@@ -320,6 +338,16 @@ def expect(endpoint: Endpoint, name: str, wanted: float, actual: float, toleranc
     """See that a camera has taken a number. Raises DeviceMismatch."""
     if abs(actual - wanted) > tolerance * abs(wanted):
         raise mismatch(endpoint, f"{name} = {wanted:g}", f"{actual:g}")
+
+
+def refused_rate(endpoint: Endpoint, rate_hz: float, got: str) -> DeviceRefused:
+    """The error for a camera that keeps its frame rate while frames are taken."""
+    return endpoint.error(
+        DeviceRefused,
+        f"{rate_hz:g} frames/s from now on",
+        got,
+        "some cameras keep their rate while they take frames",
+    )
 
 
 def mismatch(endpoint: Endpoint, expected: str, got: str) -> DeviceMismatch:

@@ -7,7 +7,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -112,6 +112,19 @@ class Acquisition:
         self._next_start_s = math.inf if settings.triggered else self._start_s
         self._arm()
 
+    def set_rate(self, frame_rate_hz: float) -> None:
+        """Begin exposures at this rate from the next one on, a new period after the last."""
+        if self._running is None:
+            return
+        settings, stream = self._running
+        self._running = replace(settings, frame_rate_hz=frame_rate_hz), stream
+        if settings.single_frame or settings.triggered or not self._exposures:
+            return
+        self._start_s += (self._exposures - 1) * self._period_s(settings)
+        self._exposures = 1
+        self._next_start_s = self._following_start_s(self._running[0])
+        self._arm()
+
     def trigger(self) -> None:
         """Begin an exposure, unless the camera waits for none or is still busy with the last one."""
         if self._running is None or not self._running[0].triggered:
@@ -177,7 +190,10 @@ class Acquisition:
     def _following_start_s(self, settings: AcquisitionSettings) -> float:
         if settings.single_frame or settings.triggered:
             return math.inf
-        return self._start_s + self._exposures / (self._true_rate_hz or settings.frame_rate_hz)
+        return self._start_s + self._exposures * self._period_s(settings)
+
+    def _period_s(self, settings: AcquisitionSettings) -> float:
+        return 1 / (self._true_rate_hz or settings.frame_rate_hz)
 
     def _emit(self, frame: _InFlight) -> None:
         late_s = time.monotonic() - frame.due_s

@@ -99,10 +99,10 @@ LOCKED_WHILE_RUNNING = frozenset(
         Feature.OFFSET_Y,
         Feature.PIXEL_FORMAT,
         Feature.EXPOSURE_TIME_US,
-        Feature.FRAME_RATE_HZ,
     }
 )
 _WRITABLE = LOCKED_WHILE_RUNNING | {
+    Feature.FRAME_RATE_HZ,
     Register.HEARTBEAT_TIMEOUT_MS,
     Register.TIMESTAMP_CONTROL,
     Register.CONTROL_PRIVILEGE,

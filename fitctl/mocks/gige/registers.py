@@ -221,6 +221,8 @@ class Registers(Memory):
         if not low <= value <= high:
             raise RegisterError(Status.INVALID_PARAMETER)
         self.set_double(address, value)
+        if address == Feature.FRAME_RATE_HZ:
+            self._acquisition.set_rate(value)
 
     def _start_acquisition(self, _value: int) -> None:
         if self._acquisition.running:

@@ -122,6 +122,7 @@ class _Loop:
         self._held = holds
         why_back = learning.observe(
             shown.time_s,
+            shown.mid_exposure_s,
             (shown.error_az_px, shown.error_el_px) if shown.star_visible else None,
             (shown.target_az_px, shown.target_el_px),
             (np.array([shown.mirror_az_rad, shown.mirror_el_rad]), frame.beam_rad),

@@ -114,6 +114,40 @@ def test_the_frame_carries_the_middle_of_its_exposure(serve: Serve, connect: Con
     assert [b.number - a.number for a, b in pairwise(taken)] == [1] * 9
 
 
+def test_the_frame_rate_changes_while_frames_come(serve: Serve, connect: Connect) -> None:
+    camera = connect(serve())
+    camera.start()
+    received(camera, 3)
+    camera.set_frame_rate(25.0)
+    slower = received(camera, 8)[-4:]
+    camera.set_frame_rate(50.0)
+    usual = received(camera, 8)[-4:]
+
+    for frames, period_s in ((slower, 0.04), (usual, 0.02)):
+        apart_s = np.diff([frame.mid_exposure_s for frame in frames])
+        assert apart_s == pytest.approx(period_s, rel=0.02)
+    assert camera.counts().lost == 0
+
+
+def test_a_frame_rate_that_does_not_fit_is_refused_and_the_camera_keeps_its_own(
+    serve: Serve, connect: Connect
+) -> None:
+    camera = connect(serve())
+    camera.start()
+    with pytest.raises(DeviceRefused, match=r"expected 1e\+06 frames/s from now on"):
+        camera.set_frame_rate(1e6)
+    apart_s = np.diff([frame.mid_exposure_s for frame in received(camera, 5)])
+
+    assert apart_s == pytest.approx(0.02, rel=0.02)
+
+
+def test_a_closed_camera_has_no_frame_rate(serve: Serve, connect: Connect) -> None:
+    camera = connect(serve())
+    camera.close()
+    with pytest.raises(DeviceUnreachable):
+        camera.set_frame_rate(25.0)
+
+
 def test_frames_of_a_camera_without_a_clock_are_as_old_as_the_rig_file_says(
     serve: Serve, connect: Connect
 ) -> None:

@@ -25,6 +25,13 @@ found = {
     "lost": counts.lost,
     "packets_lost": counts.packets_lost,
 }
+camera.set_frame_rate(25.0)
+slower = [frame for _ in range(10) if (frame := camera.next_frame(2.0)) is not None]
+found["slower_s"] = np.diff([frame.mid_exposure_s for frame in slower])[-4:].tolist()
+try:
+    camera.set_frame_rate(1e6)
+except DeviceMismatch as error:
+    found["too fast"] = str(error)
 for kind in (AravisCamera, GigeCamera):
     second = kind(settings)
     try:

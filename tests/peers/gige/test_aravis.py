@@ -190,6 +190,8 @@ def test_the_back_end_gives_the_same_frames() -> None:
     assert found["same"]
     assert min(found["ages_s"]) >= 0.034
     assert (found["lost"], found["packets_lost"]) == (0, 0)
+    assert found["slower_s"] == pytest.approx([0.04] * 4, rel=0.02)
+    assert "expected frame rate = 1e+06, got 100" in found["too fast"]
     assert "control of the camera" in found["AravisCamera"]
     assert "control of the camera" in found["GigeCamera"]
     assert "Width" in found["wide"]

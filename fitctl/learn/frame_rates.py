@@ -1,0 +1,201 @@
+"""Vibrations told from their aliases by a short change of the frame rate.
+
+On frames of one rate, a vibration looks like those that are faster by a multiple of the rate, or as far below
+one. At another rate it stays where it was only if it is slower than half of both. So at the other rate the line
+is at one of a few frequencies, and the likelihoods tell at which, and how surely.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+
+from fitctl.controllers.design.linear_loop.spectrum import air_of
+from fitctl.learn.aliases import SAME_LINE_HZ
+from fitctl.learn.night import LEAST_LINE_HZ, LearntLine, Night
+from fitctl.learn.opened import Opened, Series, periodograms
+from fitctl.learn.whittle import Guess, LineGuess, likeliest
+from fitctl.loop.frame_rate import MEDIAN_OF, OTHER_RATE, off_grid
+
+Floats = NDArray[np.float64]
+Rows = NDArray[np.intp]
+OTHER_RATES = (0.96, 0.95, 0.97, 0.94)
+"""Of the rig's frame rate: a change to one of these, which keeps lines and possible aliases farthest apart."""
+_MULTIPLES = 2  # of the frame rate, beside which aliases are looked for
+WORTH_TELLING = 1.1
+"""Times the bound: designs that leave more may gain by being sure that a line is no alias."""
+_ROUNDS = 3
+_STAYS_HZ = 0.2
+"""So far a line may be from where it is expected."""
+_SURE = 6.0
+"""By how much the logarithm of the likelihood must be higher in one case: it is 400 times as likely."""
+
+
+class Told(NamedTuple):
+    """A line, and whether it is an alias, as another frame rate has shown."""
+
+    frequency_hz: float
+    is_alias: bool
+
+
+class AtOtherRate(NamedTuple):
+    """A loop, opened, while the camera ran at another rate."""
+
+    period_s: float
+    series: list[Series]
+
+
+def by_rate(
+    exposed_s: Floats, pieces: Iterable[Rows], period_s: float
+) -> tuple[list[Rows], list[tuple[float, Rows]]]:
+    """Pieces at the rig's frame rate, and those at others, each with its frame period in s.
+
+    Parameters
+    ----------
+    exposed_s : array, shape (ticks,)
+        Of mid-exposure.
+    pieces : iterable of array of int
+        Rows of ticks, none of which lacks many frames.
+    period_s : float
+        By the rig file.
+    """
+    usual: list[Rows] = []
+    others: list[tuple[float, Rows]] = []
+    for rows in pieces:
+        late = median_filter(off_grid(np.diff(exposed_s[rows]) / period_s), MEDIAN_OF)
+        is_other = np.abs(late) > OTHER_RATE
+        for run in np.split(np.arange(len(late)), np.flatnonzero(np.diff(is_other)) + 1):
+            if is_other[run[0]]:
+                others.append((period_s * float(1 + np.median(late[run])), rows[run]))
+            else:
+                usual.append(rows[run[0] : run[-1] + 2])
+    return usual, others
+
+
+def rate_to_tell(frequencies_hz: Sequence[float], rate_hz: float) -> float:
+    """The frame rate, Hz, at which these lines and their aliases are farthest from each other.
+
+    And from 0, where no line is told from the air.
+    """
+
+    def nearest_hz(rate: float) -> float:
+        places = [_places_hz(hz, rate_hz, rate * rate_hz) for hz in frequencies_hz]
+        aliases = [hz for _, *others in places for hz in others]
+        return min(abs(hz - away) for hz in aliases for away in (0.0, *(one[0] for one in places)))
+
+    return rate_hz * max(OTHER_RATES, key=nearest_hz)
+
+
+def tell(
+    night: Night,
+    lines: Sequence[LearntLine],
+    rate_hz: float,
+    known: Iterable[Told],
+    others: Iterable[AtOtherRate],
+) -> list[Told]:
+    """What is known of a night's lines, and what other frame rates show of them.
+
+    Parameters
+    ----------
+    night : Night
+        At the rig's frame rate,
+    lines : sequence of LearntLine
+        with those of its lines that may be aliases.
+    rate_hz : float
+        The rig's.
+    known : iterable of Told
+        Before.
+    others : iterable of AtOtherRate
+        What these show counts more than what was known before. Looked at while some line is not known.
+    """
+    is_alias = {
+        line: one.is_alias
+        for line in lines
+        for one in known
+        if abs(one.frequency_hz - line.frequency_hz.value) <= SAME_LINE_HZ
+    }
+    for other in others if len(is_alias) < len(lines) else ():
+        opened = periodograms(other.series, other.period_s)
+        if opened is not None:
+            is_alias |= _shown(night, lines, opened, rate_hz)
+    return [Told(line.frequency_hz.value, is_alias[line]) for line in lines if line in is_alias]
+
+
+def _shown(
+    night: Night, lines: Sequence[LearntLine], opened: Opened, rate_hz: float
+) -> dict[LearntLine, bool]:
+    """The lines of which another frame rate shows surely whether they are aliases."""
+    places_hz = {
+        line: _places_hz(line.frequency_hz.value, rate_hz, 1 / opened.period_s) for line in lines
+    }
+    unsuspected_hz = {
+        line: line.frequency_hz.value for line in night.lines if line not in places_hz
+    }
+
+    @functools.cache
+    def cost(*seen_hz: float) -> float:
+        seen = dict(zip(places_hz, seen_hz, strict=True))
+        return _cost(night, seen | unsuspected_hz, opened)
+
+    def costs(at: int, seen_hz: Sequence[float]) -> list[float]:
+        """With one line at each of its places, and the others where they are."""
+        return [cost(*seen_hz[:at], hz, *seen_hz[at + 1 :]) for hz in places_hz[lines[at]]]
+
+    def improved(seen_hz: list[float]) -> list[float]:
+        """One line after the other where it is likeliest: where it is counts for what others explain."""
+        for _ in range(_ROUNDS):
+            before = list(seen_hz)
+            for at, line in enumerate(lines):
+                seen_hz[at] = places_hz[line][int(np.argmin(costs(at, seen_hz)))]
+            if seen_hz == before:
+                break
+        return seen_hz
+
+    begins = zip(*places_hz.values(), strict=True)  # none is an alias, or all of one kind
+    likeliest_hz = min((improved(list(begin)) for begin in begins), key=lambda end: cost(*end))
+    shown = {}
+    for at, line in enumerate(lines):
+        slow, *aliases = costs(at, likeliest_hz)
+        if abs(slow - min(aliases)) >= _SURE:
+            shown[line] = slow > min(aliases)
+    return shown
+
+
+def _places_hz(line_hz: float, rate_hz: float, other_hz: float) -> list[float]:
+    """Where a line that is seen at `line_hz` may be seen at another rate: first if it is no alias."""
+    true_hz = [line_hz] + [
+        multiple * rate_hz + side * line_hz
+        for multiple in range(1, _MULTIPLES + 1)
+        for side in (-1, 1)
+    ]
+    seen_hz = [abs(hz - round(hz / other_hz) * other_hz) for hz in true_hz]
+    return [max(LEAST_LINE_HZ, hz) for hz in seen_hz]
+
+
+def _cost(night: Night, seen_hz: Mapping[LearntLine, float], opened: Opened) -> float:
+    """Negative logarithm of the likelihood of what another rate shows, with the lines seen at these places."""
+    begin = Guess(
+        air_of(night.air_path),
+        night.noise_px.value,
+        night.mirror_gain.value,
+        night.overshoot.value,
+        tuple(
+            LineGuess(hz, line.half_width_hz.value, np.array([rms.value for rms in line.rms_px]))
+            for line, hz in seen_hz.items()
+        ),
+    )
+    # A mirror that may move otherwise than it did explains away a line that is not where it should be.
+    end = likeliest(opened, begin, free_mirror=False)
+    stayed = tuple(
+        line
+        for line, found in zip(begin.lines, end.guess.lines, strict=True)
+        if abs(found.frequency_hz - line.frequency_hz) <= _STAYS_HZ
+    )
+    if len(stayed) < len(begin.lines):  # a line that is not there has gone to explain another
+        end = likeliest(opened, begin._replace(lines=stayed), free_mirror=False)
+    return end.cost

@@ -1,0 +1,144 @@
+"""Lines told from their aliases by frames at another rate."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from benchmarks.linear_loop import held
+from fitctl.controllers.design.basis import Line
+from fitctl.learn.advice import advise
+from fitctl.learn.frame_rates import (
+    OTHER_RATES,
+    AtOtherRate,
+    Told,
+    by_rate,
+    rate_to_tell,
+)
+
+TWO_MINUTES_S, OTHER_S = 120.0, 30.0
+RATE_HZ = 50.0
+OTHER_HZ = 48.0
+
+
+def shaken(paper, *hz):
+    return dataclasses.replace(paper, lines=tuple(Line(one, 0.005, 0.05) for one in hz))
+
+
+def advised(paper, fixed, truth, other_hz=OTHER_HZ, **options):
+    """Two minutes of a night at the rig's rate, and half of one at another."""
+    slower = dataclasses.replace(truth, period_s=1 / other_hz)
+    _, series = held(truth, fixed, TWO_MINUTES_S, 5)
+    _, others = held(slower, fixed, OTHER_S, 6)
+    shown = [AtOtherRate(slower.period_s, [others])]
+    return advise([series], (0.1, 0.1), paper, fixed, others=shown, **options)
+
+
+# ---------------------------------------------------------------- telling
+
+
+@pytest.mark.parametrize("hz", [4.0, 6.0, 14.0])
+def test_a_line_that_stays_where_it_was_is_no_alias_and_is_counteracted_in_full(paper, fixed, hz):
+    advice = advised(paper, fixed, shaken(paper, hz))
+    (line,) = advice.lines
+
+    assert line.is_alias is False
+    assert line.part == 1.0
+    assert "another frame rate showed that it is no alias" in "\n".join(advice.lines_of_text())
+    assert advice.rate_to_tell_hz == 0.0
+
+
+@pytest.mark.parametrize("hz", [44.0, 56.0, 94.0])
+def test_a_line_that_moves_is_an_alias(paper, fixed, hz):
+    advice = advised(paper, fixed, shaken(paper, hz))
+    (line,) = advice.lines
+
+    assert line.found.frequency_hz.value == pytest.approx(6.0, abs=0.1)
+    assert line.is_alias is True
+    assert line.can_be_alias
+    assert "another frame rate showed that it is an alias" in "\n".join(advice.lines_of_text())
+
+
+@pytest.mark.long
+def test_each_of_several_lines_is_told(paper, fixed):
+    truth = shaken(paper, 4.0, 39.0)
+    other_hz = rate_to_tell([4.0, 11.0], RATE_HZ)
+    advice = advised(paper, fixed, truth, other_hz)
+    found = {round(line.found.frequency_hz.value): line.is_alias for line in advice.lines}
+
+    assert found == {4: False, 11: True}
+
+
+def test_too_few_frames_at_another_rate_tell_nothing(paper, fixed):
+    truth = shaken(paper, 6.0)
+    _, series = held(truth, fixed, TWO_MINUTES_S, 5)
+    slower = dataclasses.replace(truth, period_s=1 / OTHER_HZ)
+    _, short = held(slower, fixed, 10.0, 6)
+    advice = advise(
+        [series], (0.1, 0.1), paper, fixed, others=[AtOtherRate(slower.period_s, [short])]
+    )
+
+    assert advice.lines[0].is_alias is None
+
+
+@pytest.mark.parametrize(("told_hz", "expected"), [(6.2, False), (5.5, None)])
+def test_what_was_told_before_counts_for_the_same_line(paper, fixed, told_hz, expected):
+    truth = shaken(paper, 6.0)
+    _, series = held(truth, fixed, TWO_MINUTES_S, 5)
+    advice = advise([series], (0.1, 0.1), paper, fixed, known=[Told(told_hz, is_alias=False)])
+
+    assert advice.lines[0].is_alias is expected
+    assert [round(one.frequency_hz) for one in advice.told] == ([] if expected is None else [6])
+
+
+# ---------------------------------------------------------------- asking
+
+
+def test_a_line_that_is_counteracted_in_part_is_worth_another_rate(paper, fixed):
+    truth = shaken(paper, 14.0)
+    _, series = held(truth, fixed, TWO_MINUTES_S, 5)
+    advice = advise([series], (0.1, 0.1), paper, fixed)
+    text = "\n".join(advice.lines_of_text())
+
+    assert advice.lines[0].part < 1
+    assert advice.rate_to_tell_hz in {part * RATE_HZ for part in OTHER_RATES}
+    assert f"fitctl send frame-rate {advice.rate_to_tell_hz:g}" in text
+
+
+def test_a_night_without_lines_asks_for_nothing(paper, fixed):
+    _, series = held(paper, fixed, TWO_MINUTES_S, 5)
+    advice = advise([series], (0.0, 0.0), paper, fixed)
+
+    assert advice.rate_to_tell_hz == 0.0
+    assert "frame-rate" not in "\n".join(advice.lines_of_text())
+
+
+def test_the_rate_keeps_lines_away_from_what_others_would_be_as_aliases():
+    at_hz = rate_to_tell([6.0, 8.0], RATE_HZ)  # with 48 Hz, the alias of 8 Hz would be at 6 Hz
+
+    assert at_hz != 0.96 * RATE_HZ
+    assert rate_to_tell([60.0, 140.0], 500.0) in {part * 500.0 for part in OTHER_RATES}
+
+
+# ---------------------------------------------------------------- which frames
+
+
+def test_frames_are_parted_by_their_rate():
+    usual_s, other_s = 0.02, 1 / 48.0
+    apart_s = np.concatenate([np.full(500, usual_s), np.full(300, other_s), np.full(400, usual_s)])
+    exposed_s = 100.0 + np.cumsum(apart_s)
+    usual, others = by_rate(exposed_s, [np.arange(len(exposed_s))], usual_s)
+    ((period_s, rows),) = others
+
+    assert [len(one) for one in usual] == pytest.approx([500, 400], abs=10)
+    assert period_s == pytest.approx(other_s, rel=1e-3)
+    assert len(rows) == pytest.approx(300, abs=10)
+
+
+def test_pieces_at_the_usual_rate_stay_whole():
+    exposed_s = 0.02 * np.delete(np.arange(1000), [300, 301, 700])
+    rows = np.arange(len(exposed_s))
+    usual, others = by_rate(exposed_s, [rows, rows[:2]], 0.02)
+
+    assert [one.tolist() for one in usual] == [rows.tolist(), [0, 1]]
+    assert others == []

@@ -1,0 +1,245 @@
+"""Another frame rate for a while: by command or for the learner, and always back to the rig file's."""
+
+import numpy as np
+import pytest
+from instruments.simulated import NEAR, events_of, failing, until
+from samples.learner_reports import report
+
+from fitctl.config import default_rig_path, load_rig
+from fitctl.drivers.interface import DeviceRefused, DeviceTimeout
+from fitctl.messages.commands import (
+    Acquire,
+    Experiment,
+    FrameRate,
+    Off,
+    SequenceReport,
+    SequenceStatus,
+    Standby,
+    Stop,
+)
+from fitctl.messages.modes import Mode
+from fitctl.model.drives import Drive
+from fitctl.simulation.simulation import Simulation
+from fitctl.supervisor.frame_rate import FOR_LEARNER_S, PAUSE_S
+
+TWO_STARS = default_rig_path().with_name("two-stars.toml")
+USUAL_S, OTHER_S = 1 / 50.0, 1 / 48.0
+REFUSED = DeviceRefused("camera", "here", "48 frames/s from now on", "access denied")
+SILENT = DeviceTimeout("camera", "here", "an answer", "none")
+
+
+@pytest.fixture
+def held():
+    """A rig that holds its star, and may act on what its learner reports; the test is its learner."""
+    records = []
+    rig = load_rig(default_rig_path(), ["loops.right.learn=on"])
+    simulation = Simulation(rig, 0, record=records.append, **NEAR)
+    simulation.records = records
+    simulation.learners.clear()
+    for command in (Standby(), Acquire()):
+        assert simulation.command(command).accepted
+    until(simulation, Mode.VERNIER)
+    simulation.run(5.0)
+    return simulation
+
+
+@pytest.fixture
+def held_pair():
+    """Two loops on one camera, of which one is in use."""
+    records = []
+    simulation = Simulation(load_rig(TWO_STARS), 0, record=records.append)
+    simulation.records = records
+    assert simulation.command(Standby(loop="right")).accepted
+    simulation.run(1.0)
+    return simulation
+
+
+def period_s(simulation):
+    """Of the last frames."""
+    exposed_s = [tick.mid_exposure_s for tick in simulation.ticks if tick.loop == "right"]
+    return np.diff(exposed_s[-20:]).mean()
+
+
+def told(simulation):
+    return [event.message for event in events_of(simulation) if event.source == "camera"]
+
+
+def why_not(simulation, **values):
+    reply = simulation.command(FrameRate(**values))
+    return "" if reply.accepted else reply.text
+
+
+# ---------------------------------------------------------------- by command
+
+
+def test_the_camera_runs_at_another_rate_for_a_while_and_the_star_is_held(held):
+    assert why_not(held, rate_hz=48.0, duration_s=10.0) == ""
+    held.run(9.0)
+    assert period_s(held) == pytest.approx(OTHER_S)
+    held.run(2.0)
+
+    assert period_s(held) == pytest.approx(USUAL_S)
+    assert told(held) == ["runs at 48 Hz for 10 s", "runs at 50 Hz again"]
+    assert held.ticks[-1].mode == "VERNIER"
+    assert max(abs(tick.error_az_px) for tick in held.ticks[-500:]) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("values", "text"),
+    [
+        ({"rate_hz": 50.0}, "must be 45 to 49 Hz, got 50"),
+        ({"rate_hz": 20.0}, "must be 45 to 49 Hz, got 20"),
+        ({"rate_hz": float("nan")}, "must be 45 to 49 Hz, got nan"),
+        ({"rate_hz": 48.0, "duration_s": 600.0}, "duration_s must be 1 to 120, got 600"),
+    ],
+)
+def test_other_values_are_refused(held, values, text):
+    assert text in why_not(held, **values)
+
+
+def test_a_second_change_is_refused_until_the_first_has_ended(held):
+    assert why_not(held, rate_hz=48.0, duration_s=5.0) == ""
+    held.run(0.1)
+    assert "runs at 48 Hz already" in why_not(held, rate_hz=47.0)
+    held.run(6.0)
+    assert why_not(held, rate_hz=47.0) == ""
+
+
+def test_a_closed_camera_has_no_rate():
+    simulation = Simulation(load_rig(default_rig_path()), 0)
+
+    assert "needs an open camera" in why_not(simulation, rate_hz=48.0)
+
+
+def test_a_camera_that_is_opened_again_runs_as_the_rig_file_says(held):
+    assert why_not(held, rate_hz=48.0, duration_s=60.0) == ""
+    held.run(1.0)
+    for command in (Stop(), Off()):
+        assert held.command(command).accepted
+        held.run(2.0)
+    assert held.command(Standby()).accepted
+    held.run(2.0)
+
+    assert period_s(held) == pytest.approx(USUAL_S)
+    assert why_not(held, rate_hz=47.0) == ""
+
+
+def test_opening_another_loop_does_not_make_the_change_last(held_pair):
+    """Found by the swarm: the camera stayed at the other rate, for it was taken for one just opened."""
+    assert why_not(held_pair, rate_hz=48.0, duration_s=5.0) == ""
+    held_pair.run(1.0)
+    assert held_pair.command(Standby(loop="left")).accepted
+    held_pair.run(5.0)
+
+    assert period_s(held_pair) == pytest.approx(USUAL_S)
+    assert told(held_pair)[-1] == "runs at 50 Hz again"
+
+
+def test_an_experiment_has_the_rigs_rate(held):
+    assert why_not(held, rate_hz=48.0, duration_s=60.0) == ""
+    held.run(1.0)
+    drive = Drive(
+        channel="siderostat_az", shape="sine", amplitude=2.0, frequency_hz=1.0, duration_s=2.0
+    )
+    assert held.command(Experiment(name="sine", drives=[drive])).accepted
+    held.run(1.0)
+
+    assert held.ticks[-1].mode == "EXPERIMENT"
+    assert period_s(held) == pytest.approx(USUAL_S)
+    assert "an experiment needs the rig's frame rate" in why_not(held, rate_hz=47.0)
+
+
+# ---------------------------------------------------------------- cameras that do not obey
+
+
+def test_a_camera_that_keeps_its_rate_goes_on(held):
+    held.camera.set_frame_rate = failing(REFUSED)
+    assert why_not(held, rate_hz=48.0) == ""
+    held.run(1.0)
+
+    assert "keeps its frame rate: camera at here" in told(held)[0]
+    assert held.ticks[-1].mode == "VERNIER"
+    assert why_not(held, rate_hz=47.0) == ""
+
+
+def test_a_rate_that_is_not_known_is_set_back(held):
+    change, asked_hz = held.camera.set_frame_rate, []
+
+    def late(rate_hz):
+        asked_hz.append(rate_hz)
+        change(rate_hz)
+        if rate_hz == 48.0:
+            raise SILENT
+
+    held.camera.set_frame_rate = late
+    assert why_not(held, rate_hz=48.0) == ""
+    held.run(1.0)
+
+    assert asked_hz == [48.0, 50.0]
+    assert period_s(held) == pytest.approx(USUAL_S)
+    assert "may run at 48 or 50 Hz" in told(held)[0]
+    assert held.ticks[-1].mode == "VERNIER"
+
+
+def test_a_camera_that_cannot_be_set_back_has_failed(held):
+    assert why_not(held, rate_hz=48.0, duration_s=2.0) == ""
+    held.run(1.0)
+    held.camera.set_frame_rate = failing(SILENT)
+    held.run(2.0)
+
+    assert held.ticks[-1].mode == "SAFE"
+
+
+# ---------------------------------------------------------------- for the learner
+
+
+def test_the_learner_gets_its_rate_once_and_later_again(held):
+    wish = report(worth_it=False, rate_to_tell_hz=48.0)
+    assert held.command(wish).accepted
+    held.run(1.0)
+    assert period_s(held) == pytest.approx(OTHER_S)
+    held.run(FOR_LEARNER_S)
+    assert period_s(held) == pytest.approx(USUAL_S)
+    held.command(wish)
+    held.run(1.0)
+    assert period_s(held) == pytest.approx(USUAL_S)
+
+
+@pytest.mark.long
+def test_after_a_pause_the_learner_gets_its_rate_again(held):
+    wish = report(worth_it=False, rate_to_tell_hz=48.0)
+    held.command(wish)
+    held.run(PAUSE_S + 1.0)
+    held.command(wish)
+    held.run(1.0)
+
+    assert period_s(held) == pytest.approx(OTHER_S)
+
+
+@pytest.mark.parametrize("wish_hz", [0.0, 10.0, 50.0, float("nan")])
+def test_a_rate_that_cannot_be_is_no_wish(held, wish_hz):
+    assert held.command(report(worth_it=False, rate_to_tell_hz=wish_hz)).accepted
+    held.run(1.0)
+
+    assert period_s(held) == pytest.approx(USUAL_S)
+
+
+def test_a_sequence_keeps_the_rigs_rate(held):
+    status = SequenceStatus(run="1", name="night", state="running", steps=3)
+    assert held.command(SequenceReport(status=status)).accepted
+    held.command(report(worth_it=False, rate_to_tell_hz=48.0))
+    held.run(1.0)
+
+    assert period_s(held) == pytest.approx(USUAL_S)
+
+
+def test_with_advice_alone_the_rate_stays():
+    simulation = Simulation(load_rig(default_rig_path()), 0, **NEAR)
+    for command in (Standby(), Acquire()):
+        assert simulation.command(command).accepted
+    until(simulation, Mode.VERNIER)
+    simulation.run(5.0)
+    simulation.command(report(worth_it=False, rate_to_tell_hz=48.0))
+    simulation.run(1.0)
+
+    assert period_s(simulation) == pytest.approx(USUAL_S)
