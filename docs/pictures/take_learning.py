@@ -17,6 +17,7 @@ from scipy.signal import welch
 from fitctl import demo
 from fitctl.config import default_rig_path
 from fitctl.identify.drawing import BLUE, GREEN, VERMILION, for_dark_pages, new_figure
+from fitctl.logging.records import CAMERA
 from fitctl.messages.client import Client
 from fitctl.mocks.bench import Residual, ResidualQuestion, ask_bench
 from fitctl.tui.app import ConsoleApp
@@ -28,7 +29,7 @@ NIGHT = (
     f"plant.loops.{LOOP}.lines=[{{frequency_hz=6.0,rms_px=0.0707,direction_deg=45.0,damping=0.005,"
     "drift_hz_per_min=0.0}]",
 )
-JUDGED_S, AFTER_S, LONGEST_S = 40.0, 60.0, 300.0
+JUDGED_S, AFTER_S, LONGEST_S = 40.0, 150.0, 400.0
 SIZE = (120, 40)
 HERE = Path(__file__).parent
 
@@ -53,22 +54,28 @@ def true_px(running: demo.Instrument, start_s: float, end_s: float) -> tuple[flo
     return found.az_rms_px, found.el_rms_px
 
 
-def draw(rows: np.ndarray, changed_s: float, period_s: float) -> None:
+def draw(
+    rows: np.ndarray, changes_s: list[float], other_rate_s: list[float], period_s: float
+) -> None:
     """Each axis' error on frames over time, and the spectrum of both before and after."""
+    changed_s, *_ = changes_s
     figure = new_figure(height_in=6.4)
     az, el, spectrum = figure.subplots(3, 1, height_ratios=(2, 2, 3))
     el.sharex(az)
     el.sharey(az)
     for column, (axis, course) in enumerate((("az", az), ("el", el)), 1):
         course.plot(rows[:, 0] - changed_s, rows[:, column], color=BLUE, linewidth=0.5)
-        course.axvline(0.0, color=GREEN)
+        for at_s in changes_s:
+            course.axvline(at_s - changed_s, color=GREEN)
+        if other_rate_s:  # it began, and ended
+            course.axvspan(*(at_s - changed_s for at_s in other_rate_s), color=GREEN, alpha=0.15)
         course.set(ylabel=f"{axis} (px)")
-    az.set(title="error on frames")
+    az.set(title="error on frames; lines: changes of design; shaded: another frame rate")
     az.tick_params(labelbottom=False)
-    el.set(xlabel="time from the change of design (s)")
+    el.set(xlabel="time from the first change of design (s)")
     parts = (
         (rows[:, 0] < changed_s, VERMILION, "before"),
-        (rows[:, 0] > changed_s + 3, GREEN, "after"),
+        (rows[:, 0] > max(*changes_s, *other_rate_s) + 3, GREEN, "after"),
     )
     for part, colour, name in parts:
         hz, psd = welch(rows[part][:, 1:], 1 / period_s, nperseg=512, axis=0)
@@ -81,10 +88,10 @@ def draw(rows: np.ndarray, changed_s: float, period_s: float) -> None:
 
 
 def main() -> None:
-    """Hold the star until the design has changed, and a minute longer."""
+    """Hold the star until the design has changed, and long enough for the change of the frame rate."""
     with demo.instrument(default_rig_path(), NIGHT, seed=3) as running:
         demo.acquire(running)
-        rows, changed_s, begun_s = [], 0.0, time.monotonic()
+        rows, changes_s, other_rate_s, begun_s = [], [], [], time.monotonic()
         before_px = (np.nan, np.nan)
         texts = []
         while time.monotonic() < begun_s + LONGEST_S:
@@ -96,11 +103,18 @@ def main() -> None:
                 for tick in telemetry.ticks
                 if tick.mode == "VERNIER" and tick.star_visible
             ]
-            texts += [event.message for event in telemetry.events if "learnt" in event.message]
-            if not changed_s and telemetry.loops[0].controller == "learnt":
-                changed_s = telemetry.time_s
-                before_px = true_px(running, changed_s - JUDGED_S, changed_s - 0.5)
-            if changed_s and telemetry.time_s > changed_s + AFTER_S:
+            changes = [event for event in telemetry.events if "-> learnt" in event.message]
+            rates = [event for event in telemetry.events if event.source == CAMERA]
+            texts += [event.message for event in (*changes, *rates)]
+            report = telemetry.loops[0].learning.report
+            if report is not None and (not texts or texts[-1] != report.text):
+                texts.append(report.text)
+            other_rate_s += [event.time_s for event in rates]
+            if changes and not changes_s:
+                at_s = changes[0].time_s
+                before_px = true_px(running, at_s - JUDGED_S, at_s - 0.5)
+            changes_s += [event.time_s for event in changes]
+            if changes_s and telemetry.time_s > changes_s[0] + AFTER_S:
                 break
         now_s = rows[-1][0]
         after_px = true_px(running, now_s - JUDGED_S, now_s)
@@ -109,9 +123,10 @@ def main() -> None:
         size = learner.memory_info().rss / 1e6
         asyncio.run(console(running))
     table = np.array(rows)
-    draw(table[table[:, 0] > table[0, 0] + 5.0], changed_s, running.rig.camera.period_s)
+    table = table[table[:, 0] > table[0, 0] + 5.0]
+    draw(table, changes_s, other_rate_s, running.rig.camera.period_s)
     print(*texts, sep="\n")
-    print(f"changed {changed_s - rows[0][0]:.1f} s after VERNIER; load {os.getloadavg()[0]:.1f}")
+    print(f"changed {changes_s[0] - rows[0][0]:.1f} s after VERNIER; load {os.getloadavg()[0]:.1f}")
     print(f"true px before {before_px}, after {after_px}; learner {size:.0f} MB resident")
 
 

@@ -56,6 +56,11 @@ class DesignJobs:
         self._wanted: dict[str, Future] = {}  # of each loop, by its last `controller` command
         self._starlight = [Starlight(rig, loop, journal) for loop in loops.values()]
 
+    @property
+    def busy(self) -> bool:
+        """Designs are being made."""
+        return bool(self._jobs)
+
     def finish(self) -> None:
         """Have the loops use the designs that are ready, in the order of the requests."""
         while self._jobs and self._jobs[0].future.done():

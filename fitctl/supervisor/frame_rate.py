@@ -15,8 +15,8 @@ from fitctl.supervisor.camera_watch import CameraWatch
 SLOWER = (0.9, 0.98)
 """Of the rig's frame rate: between these, exposures fit, designs still hold the star, and a line moves."""
 LONGEST_S = 120.0
-FOR_LEARNER_S = 30.0
-"""So long for the learner,"""
+FOR_LEARNER_S = 25.0
+"""So long for the learner, whose next report then comes when the usual rate is back,"""
 PAUSE_S, MOST_PAUSE_S = 600.0, 9600.0
 """and not again for so long; twice as long each time."""
 
@@ -88,9 +88,9 @@ class FrameRateChange:
         self._set(rate_hz)
 
     def for_learner(self, rate_hz: float) -> None:
-        """Change the rate so that lines are told from aliases, unless that was done lately."""
+        """Change the rate so that lines are told from aliases, unless that was done lately; 0 is no rate."""
         now_s = self._clock.now_s()
-        if now_s < self._learner_from_s or self.why_not(rate_hz, FOR_LEARNER_S):
+        if not rate_hz or now_s < self._learner_from_s or self.why_not(rate_hz, FOR_LEARNER_S):
             return
         self._learner_from_s = now_s + self._pause_s
         self._pause_s = min(2 * self._pause_s, MOST_PAUSE_S)

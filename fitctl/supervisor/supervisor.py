@@ -509,9 +509,6 @@ class Supervisor:
         if why_not:
             return _refusal(why_not)
         self._design_jobs.learn(loop, report)
-        occupied = self._device_jobs.busy or self.sequences.under_way
-        if not occupied and loop.learning.may_act(self._clock.now_s()):
-            self._frame_rate.for_learner(report.rate_to_tell_hz)
         return Reply(accepted=True)
 
     # ------------------------------------------------------------ beside the ticks
@@ -540,6 +537,7 @@ class Supervisor:
 
     def _once_a_second(self) -> None:
         now_s = self._reported_s = self._clock.now_s()
+        self._tell_lines(now_s)
         # Nothing is timed while devices are let go or being opened: imports and parsing hold everything.
         if not self._device_jobs.busy:
             self._timing.report(
@@ -565,6 +563,15 @@ class Supervisor:
         # Before the collector is to move, nobody has asked for the hexapod.
         if self.collector is not None and (self.collector.is_open or self.collector.error):
             self._record(hexapod_health(self.collector, now_s))
+
+    def _tell_lines(self, now_s: float) -> None:
+        """Change the frame rate for a learner that asks for it, once its design is in use."""
+        if self._device_jobs.busy or self._design_jobs.busy or self.sequences.under_way:
+            return
+        for loop in self.stellar_loops.values():
+            report = loop.learning.report
+            if report is not None and loop.learning.may_act(now_s):
+                self._frame_rate.for_learner(report.rate_to_tell_hz)
 
     def _timed(self, record: LoopTiming) -> None:
         self.loops[record.loop].quantities.record_timing(record)

@@ -7,6 +7,7 @@ from samples.learner_reports import report
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.drivers.interface import DeviceRefused, DeviceTimeout
+from fitctl.logging.records import ControllerChange, Event
 from fitctl.messages.commands import (
     Acquire,
     Experiment,
@@ -196,22 +197,34 @@ def test_a_camera_that_cannot_be_set_back_has_failed(held):
 def test_the_learner_gets_its_rate_once_and_later_again(held):
     wish = report(worth_it=False, rate_to_tell_hz=48.0)
     assert held.command(wish).accepted
-    held.run(1.0)
+    held.run(2.0)
     assert period_s(held) == pytest.approx(OTHER_S)
     held.run(FOR_LEARNER_S)
     assert period_s(held) == pytest.approx(USUAL_S)
     held.command(wish)
-    held.run(1.0)
+    held.run(2.0)
     assert period_s(held) == pytest.approx(USUAL_S)
+
+
+def test_a_design_that_is_worth_it_comes_before_another_rate(held):
+    held.command(report(rate_to_tell_hz=48.0))
+    held.run(3.0)
+    change, rate = (
+        next(record.time_s for record in held.records if isinstance(record, kind) and is_it(record))
+        for kind, is_it in (
+            (ControllerChange, lambda one: one.target == "learnt"),
+            (Event, lambda one: one.message == "runs at 48 Hz for 25 s"),
+        )
+    )
+
+    assert change <= rate
 
 
 @pytest.mark.long
 def test_after_a_pause_the_learner_gets_its_rate_again(held):
     wish = report(worth_it=False, rate_to_tell_hz=48.0)
     held.command(wish)
-    held.run(PAUSE_S + 1.0)
-    held.command(wish)
-    held.run(1.0)
+    held.run(PAUSE_S + 4.0)
 
     assert period_s(held) == pytest.approx(OTHER_S)
 
@@ -219,7 +232,7 @@ def test_after_a_pause_the_learner_gets_its_rate_again(held):
 @pytest.mark.parametrize("wish_hz", [0.0, 10.0, 50.0, float("nan")])
 def test_a_rate_that_cannot_be_is_no_wish(held, wish_hz):
     assert held.command(report(worth_it=False, rate_to_tell_hz=wish_hz)).accepted
-    held.run(1.0)
+    held.run(2.0)
 
     assert period_s(held) == pytest.approx(USUAL_S)
 
@@ -228,7 +241,7 @@ def test_a_sequence_keeps_the_rigs_rate(held):
     status = SequenceStatus(run="1", name="night", state="running", steps=3)
     assert held.command(SequenceReport(status=status)).accepted
     held.command(report(worth_it=False, rate_to_tell_hz=48.0))
-    held.run(1.0)
+    held.run(2.0)
 
     assert period_s(held) == pytest.approx(USUAL_S)
 
@@ -240,6 +253,6 @@ def test_with_advice_alone_the_rate_stays():
     until(simulation, Mode.VERNIER)
     simulation.run(5.0)
     simulation.command(report(worth_it=False, rate_to_tell_hz=48.0))
-    simulation.run(1.0)
+    simulation.run(2.0)
 
     assert period_s(simulation) == pytest.approx(USUAL_S)
