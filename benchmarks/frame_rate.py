@@ -1,9 +1,9 @@
 """What a short change of the frame rate tells of lines, and what a loop leaves that makes it by itself.
 
-Nights of one to three lines are drawn, each line slow or the alias of a slow one, and held by the linear loop at
-50 Hz and then at the rate that a learner asks for. Printed: how many lines are told rightly, wrongly, or not at
-all. Then the whole instrument holds its star on the virtual clock on nights of :mod:`benchmarks.learn_online`
-whose lines are slow. True residual in continuous time, of the worst axis.
+Nights of one to three lines are drawn, each line slow or the alias of a slow one, and held by the linear loop
+at 50 Hz and then at the rate that a learner asks for. Printed: how many lines are told rightly, wrongly, or not
+at all. Then the whole instrument holds its star on the virtual clock, on those nights of
+:mod:`benchmarks.learn_online` whose lines are slow. True residual in continuous time, of the worst axis.
 """
 
 from __future__ import annotations

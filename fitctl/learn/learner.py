@@ -158,7 +158,8 @@ class Learner:
         pieces, others = by_rate(ticks["mid_exposure_s"], pieces, self._period_s)
         theory = loop_theory(self._rig, self._loop_name, present)
         error_px = np.stack([ticks["error_az_px"], ticks["error_el_px"]], axis=-1)
-        own = error_px[ticks["time_s"] >= self._since_s + SETTLE_S]
+        usual = np.concatenate([np.empty(0, int), *pieces])
+        own = error_px[usual][ticks["time_s"][usual] >= self._since_s + SETTLE_S]
         az_px, el_px = (
             np.sqrt(np.mean(own**2, axis=0)).tolist()
             if len(own) * self._period_s >= LEAST_S

@@ -11,6 +11,7 @@ from fitctl.logging.records import StarPlace
 from fitctl.messages.commands import (
     Acquire,
     Experiment,
+    FrameRate,
     Look,
     Off,
     Recover,
@@ -239,6 +240,20 @@ def a_learnt_design(simulation):
     simulation.run(2.0)
 
 
+def another_frame_rate(simulation):
+    """By command, and for the learner, until an experiment ends it."""
+    hold_a_star(simulation)
+    simulation.run(3.0)
+    assert simulation.command(FrameRate(rate_hz=48.0, duration_s=2.0)).accepted
+    simulation.run(6.0)
+    simulation.command(learner_report(worth_it=False, rate_to_tell_hz=47.0))
+    simulation.run(3.0)
+    assert simulation.camera._period_s == 1 / 47.0
+    simulation.command(Experiment(loop="right", name="try", drives=SCAN))
+    simulation.run(2.5)
+    assert simulation.camera._period_s == 1 / 50.0
+
+
 def two_loops():
     document = load_rig(default_rig_path(), [SOON]).model_dump(mode="json")
     for loops in (document[part]["loops"] for part in ("plant", "mocks")):
@@ -298,6 +313,11 @@ COURSES = {
     "off and on": (off_and_on_in_one_breath, [], {"STOP", "OFF", "IN_REACH"}),
     "interlocks": (interlocks, INTERLOCKS, {"IN_REACH", "FAULT"}),
     "a learnt design": (a_learnt_design, [*SHAKEN, "loops.right.learn=on"], {"IN_REACH"}),
+    "another frame rate": (
+        another_frame_rate,
+        [*SHAKEN, "loops.right.learn=on"],
+        {"EXPERIMENT", "EXPERIMENT_DONE"},
+    ),
     "a star of another light": (hold_a_star, FAINTER, {"IN_REACH"}),
     "several writes a frame": (every_command, SEVERAL_WRITES, {"STOP", "RECOVER", "IN_REACH"}),
     "several writes a frame, and a lost star": (
