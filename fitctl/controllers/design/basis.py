@@ -6,9 +6,12 @@ import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field, ValidationError
 
 from fitctl.config import AirPathModel, ConfigError, Rig, Vernier
+from fitctl.config.base import NonNegative, Positive, Settings
 from fitctl.controllers.centroid import sensor_noise_px
 from fitctl.controllers.pair import Design
 from fitctl.model.optics import scales
@@ -171,38 +174,68 @@ def night_of(design: Design, rig_basis: Basis) -> Basis:
     return replace(basis_of(design.parameters, rig_basis), guard=None)
 
 
+_QUOTED = 60  # characters of a value that cannot be
+
+
+class _Line(Settings):
+    frequency_hz: Positive
+    damping: Annotated[float, Field(gt=0, lt=1)]
+    rms_px: Positive
+
+
+class _Parameters(Settings):
+    """As :func:`design_parameters` writes them."""
+
+    noise_px: NonNegative
+    air_path: AirPathModel
+    coarse_per_s: NonNegative
+    settings: dict[str, dict[str, Any]]
+    lines: Annotated[list[_Line], Field(default_factory=list)]
+    guard: _Line | None = None
+    mirror_gain: Annotated[float, Field(ge=LEAST_GAIN, le=1 / LEAST_GAIN)] = 1.0
+    overshoot: Annotated[float, Field(ge=-MOST_OVERSHOOT, le=MOST_OVERSHOOT)] = 0.0
+    writes_per_frame: Annotated[float, Field(ge=1, multiple_of=1)] = 1
+
+
 def basis_of(parameters: Mapping[str, Any], rig_basis: Basis) -> Basis:
     """The basis that a design with these parameters was made for; the rest is the rig's.
 
     Raises
     ------
-    KeyError, TypeError, ValueError
-        If these are no :func:`design_parameters`.
+    ValueError
+        If these are no :func:`design_parameters`; with one line that names what is wrong.
     """
     settings = rig_basis.settings
-    mirror = on_its_mirror(rig_basis, parameters)
-    if not LEAST_GAIN <= mirror.mirror_gain <= 1 / LEAST_GAIN:
-        msg = f"mirror_gain: expected {LEAST_GAIN:g} to {1 / LEAST_GAIN:g}, got {mirror.mirror_gain:g}"
+    try:
+        given = _Parameters.model_validate(parameters)
+        sections = {
+            name: type(getattr(settings, name)).model_validate(values)
+            for name, values in given.settings.items()
+            if name in type(settings).model_fields
+        }
+    except ValidationError as error:
+        problem = error.errors()[0]
+        where = ".".join(map(str, problem["loc"]))
+        got = repr(problem["input"])[:_QUOTED]
+        msg = (
+            f"{where}: {problem['msg']}, got {got}" if where else "expected an object of parameters"
+        )
+        raise ValueError(msg) from None
+    if given.writes_per_frame > rig_basis.writes:
+        msg = (
+            f"writes_per_frame {given.writes_per_frame:g}, but the rig file's fsm.dac allows "
+            f"{rig_basis.writes}"
+        )
         raise ValueError(msg)
-    if not abs(mirror.overshoot) <= MOST_OVERSHOOT:
-        msg = f"overshoot: expected at most {MOST_OVERSHOOT:g} either way, got {mirror.overshoot:g}"
-        raise ValueError(msg)
-    writes = int(parameters.get("writes_per_frame", 1))
-    if not 1 <= writes <= rig_basis.writes:
-        msg = f"writes_per_frame {writes}, but the rig file's fsm.dac allows {rig_basis.writes}"
-        raise ValueError(msg)
-    sections = {
-        name: type(getattr(settings, name)).model_validate(values)
-        for name, values in parameters["settings"].items()
-        if name in type(settings).model_fields
-    }
     return replace(
-        mirror,
-        noise_px=float(parameters["noise_px"]),
-        air_path=AirPathModel.model_validate(parameters["air_path"]),
-        coarse_per_s=float(parameters["coarse_per_s"]),
+        rig_basis,
+        noise_px=given.noise_px,
+        air_path=given.air_path,
+        coarse_per_s=given.coarse_per_s,
         settings=settings.model_copy(update=sections),
-        lines=tuple(Line(**line) for line in parameters.get("lines", ())),
-        guard=Line(**parameters["guard"]) if "guard" in parameters else None,
-        writes=writes,
+        lines=tuple(Line(**line.model_dump()) for line in given.lines),
+        guard=None if given.guard is None else Line(**given.guard.model_dump()),
+        mirror_gain=given.mirror_gain,
+        overshoot=given.overshoot,
+        writes=int(given.writes_per_frame),
     )

@@ -83,17 +83,14 @@ def _learnt(document_json: str, its_basis: Basis) -> Design:
     advice = "look at what fitctl design learn makes of the log"
     try:
         document = json.loads(document_json)
-        its_basis = basis_of(document["parameters"], its_basis)
+        if not isinstance(document, dict) or str(document.get("name")) not in DESIGNS:
+            msg = f"expected an object with the name of one of {', '.join(DESIGNS)}"
+            raise ValueError(msg)
+        its_basis = basis_of(document.get("parameters", {}), its_basis)
         design = DESIGNS[document["name"]](its_basis)
-    except (
-        KeyError,
-        TypeError,
-        ValueError,
-        AttributeError,
-        ArithmeticError,
-        RecursionError,
-    ) as error:
-        msg = f"controller {LEARNT}: its parameters cannot be used: {error!r}; {advice}"
+    except (ValueError, ArithmeticError, RecursionError) as error:
+        why = str(error) if isinstance(error, ValueError) else repr(error)
+        msg = f"controller {LEARNT}: its parameters cannot be used: {why}; {advice}"
         raise ConfigError(msg) from None
     required = Required()
     if margins(design, its_basis, required).excess(required) > KEPT:
