@@ -26,6 +26,7 @@ Floats = NDArray[np.float64]
 Rows = NDArray[np.intp]
 OTHER_RATES = (0.96, 0.95, 0.97, 0.94)
 """Of the rig's frame rate: a change to one of these, which keeps lines and possible aliases farthest apart."""
+_LEAST_S = 8.0  # at another rate: lines that are worth it show within a few seconds
 _MULTIPLES = 2  # of the frame rate, beside which aliases are looked for
 WORTH_TELLING = 1.1
 """Times the bound: designs that leave more may gain by being sure that a line is no alias."""
@@ -120,7 +121,7 @@ def tell(
         if abs(one.frequency_hz - line.frequency_hz.value) <= SAME_LINE_HZ
     }
     for other in others if len(is_alias) < len(lines) else ():
-        opened = periodograms(other.series, other.period_s)
+        opened = periodograms(other.series, other.period_s, _LEAST_S)
         if opened is not None:
             is_alias |= _shown(night, lines, opened, rate_hz)
     return [Told(line.frequency_hz.value, is_alias[line]) for line in lines if line in is_alias]

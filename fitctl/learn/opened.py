@@ -191,15 +191,17 @@ def _timely(ticks: Columns, rows: NDArray[np.intp], period_s: float) -> NDArray[
     return np.isnan(off_s) | (off_s <= usual_s)
 
 
-def periodograms(series: Sequence[Series], period_s: float) -> Opened | None:
-    """Of pieces, each cut into segments of equal length; None if all are shorter than `LEAST_S`."""
+def periodograms(
+    series: Sequence[Series], period_s: float, least_s: float = LEAST_S
+) -> Opened | None:
+    """Of pieces, each cut into segments of equal length; None if all are shorter than `least_s`."""
     parts: list[tuple[NDArray[Any], ...]] = []
     frames = 0
     inflation = 1.0
     for piece in series:
         count = max(1, round(len(piece.disturbance_px) * period_s / SEGMENT_S))
         length = len(piece.disturbance_px) // count
-        if length * period_s < LEAST_S:
+        if length * period_s < least_s:
             continue
         window = taper(length, TAPERED)
         inflation = float(length * np.sum(window**4) / np.sum(window**2) ** 2)

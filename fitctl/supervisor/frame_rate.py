@@ -15,9 +15,9 @@ from fitctl.supervisor.camera_watch import CameraWatch
 SLOWER = (0.9, 0.98)
 """Of the rig's frame rate: between these, exposures fit, designs still hold the star, and a line moves."""
 LONGEST_S = 120.0
-FOR_LEARNER_S = 25.0
-"""So long for the learner, whose next report then comes when the usual rate is back,"""
-PAUSE_S, MOST_PAUSE_S = 600.0, 9600.0
+FOR_LEARNER_S = 12.0
+"""So long for the learner: designs made for the usual rate leave more of a line meanwhile;"""
+PAUSE_S, MOST_PAUSE_S = 120.0, 7680.0
 """and not again for so long; twice as long each time."""
 
 

@@ -16,7 +16,7 @@ from fitctl.learn.frame_rates import (
     rate_to_tell,
 )
 
-TWO_MINUTES_S, OTHER_S = 120.0, 30.0
+TWO_MINUTES_S, OTHER_S = 120.0, 11.0
 RATE_HZ = 50.0
 OTHER_HZ = 48.0
 
@@ -73,7 +73,7 @@ def test_too_few_frames_at_another_rate_tell_nothing(paper, fixed):
     truth = shaken(paper, 6.0)
     _, series = held(truth, fixed, TWO_MINUTES_S, 5)
     slower = dataclasses.replace(truth, period_s=1 / OTHER_HZ)
-    _, short = held(slower, fixed, 10.0, 6)
+    _, short = held(slower, fixed, 6.0, 6)
     advice = advise(
         [series], (0.1, 0.1), paper, fixed, others=[AtOtherRate(slower.period_s, [short])]
     )

@@ -213,7 +213,7 @@ def test_a_design_that_is_worth_it_comes_before_another_rate(held):
         next(record.time_s for record in held.records if isinstance(record, kind) and is_it(record))
         for kind, is_it in (
             (ControllerChange, lambda one: one.target == "learnt"),
-            (Event, lambda one: one.message == "runs at 48 Hz for 25 s"),
+            (Event, lambda one: one.message == "runs at 48 Hz for 12 s"),
         )
     )
 
