@@ -23,6 +23,7 @@ from fitctl.controllers.design.margins import (
     frequencies_hz,
     margins,
 )
+from fitctl.controllers.design.minimum_variance import design_minimum_variance
 from fitctl.controllers.pair import LEARNT, Design
 from fitctl.learn.aliases import (
     IfAliases,
@@ -147,6 +148,8 @@ class Advice(NamedTuple):
         The same without lines.
     filled : int
         Frames that are missing, or that a late command met.
+    expecting_px : tuple of float
+        Residual of designs without margins that expect the lines as the learnt one does, and in full.
     period_s : float
         Of frames.
     """
@@ -164,6 +167,7 @@ class Advice(NamedTuple):
     shown_px: tuple[float, float]
     without_lines_px: tuple[float, float]
     filled: int
+    expecting_px: tuple[float, float]
     period_s: float
 
     @property
@@ -199,7 +203,7 @@ class Advice(NamedTuple):
             self.shown_px,
             self.without_lines_px,
         )
-        return shown_learnt_px * calm_learnt_px <= shown_px * calm_px
+        return shown_learnt_px**2 + calm_learnt_px**2 <= shown_px**2 + calm_px**2
 
     @property
     def _better_lately(self) -> bool:
@@ -209,9 +213,9 @@ class Advice(NamedTuple):
     @property
     def rate_to_tell_hz(self) -> float:
         """The frame rate that would tell lines from aliases, if that is worth it; otherwise 0."""
-        least_px = min(self.present.residual_px, self.learnt.residual_px)
         open_hz = [line.found.frequency_hz.value for line in self.lines if line.is_open]
-        if not open_hz or least_px < WORTH_TELLING * self.bound_px:
+        in_part_px, in_full_px = self.expecting_px
+        if not open_hz or in_full_px > WORTH_TELLING * in_part_px:
             return 0.0
         return rate_to_tell(open_hz, 1 / self.period_s)
 
@@ -423,6 +427,10 @@ def advise(
         shown_px=_left(present, design, shown),
         without_lines_px=_left(present, design, dataclasses.replace(shown, lines=())),
         filled=sum(one.filled for one in series),
+        expecting_px=(
+            linear_residual(design_minimum_variance(expecting(parts, truth)), truth),
+            linear_residual(design_minimum_variance(truth), truth),
+        ),
         period_s=truth.period_s,
     )
 

@@ -28,8 +28,8 @@ OTHER_RATES = (0.96, 0.95, 0.97, 0.94)
 """Of the rig's frame rate: a change to one of these, which keeps lines and possible aliases farthest apart."""
 _LEAST_S = 8.0  # at another rate: lines that are worth it show within a few seconds
 _MULTIPLES = 2  # of the frame rate, beside which aliases are looked for
-WORTH_TELLING = 1.1
-"""Times the bound: designs that leave more may gain by being sure that a line is no alias."""
+WORTH_TELLING = 0.95
+"""A design that expects all lines in full must leave at most this part, or another rate is not worth it."""
 _ROUNDS = 3
 _STAYS_HZ = 0.2
 """So far a line may be from where it is expected."""

@@ -148,7 +148,7 @@ class FrameRate(Command, frozen=True, kw_only=True):
     """
 
     rate_hz: float
-    duration_s: float = 30.0
+    duration_s: float = 15.0
 
 
 class Experiment(Command, frozen=True, kw_only=True):
