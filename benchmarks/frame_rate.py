@@ -72,7 +72,10 @@ def told(number: int, seed: int) -> Counter[str]:
         slower, fixed, other_s, 2 * number + 1, mirror_gain=gain, overshoot=other_overshoot
     )
     shown = AtOtherRate(slower.period_s, [other])
-    answers = dict(tell(night, night.lines, 1 / paper.period_s, [], [shown]))
+    answers = {
+        one.frequency_hz: one.is_alias
+        for one in tell(night, night.lines, 1 / paper.period_s, [], [shown])
+    }
     counted: Counter[str] = Counter()
     for hz in found_hz:
         may_be = {alias for seen, alias in is_alias.items() if abs(seen - hz) <= SAME_LINE_HZ}

@@ -27,6 +27,7 @@ from fitctl.controllers.design.minimum_variance import design_minimum_variance
 from fitctl.controllers.pair import LEARNT, Design
 from fitctl.learn.aliases import (
     IfAliases,
+    at_frequency,
     both_if_aliases,
     can_be_alias,
     expecting,
@@ -75,8 +76,8 @@ class LineAdvice(NamedTuple):
         Of the line's RMS that the learnt design expects: 1 counteracts the line in full, 0 leaves it alone.
     can_be_alias : bool
         The rig may have vibrations as fast as its aliases, and no other frame rate has shown that it is none.
-    is_alias : bool or None
-        What another frame rate has shown; None without one.
+    true_hz : float or None
+        Where it is, as another frame rate has shown; None without one.
     if_alias : IfAliases
         Residual of both designs if the line is one of its aliases.
     """
@@ -84,7 +85,7 @@ class LineAdvice(NamedTuple):
     found: LearntLine
     part: float
     can_be_alias: bool
-    is_alias: bool | None
+    true_hz: float | None
     if_alias: IfAliases
 
     @property
@@ -95,7 +96,7 @@ class LineAdvice(NamedTuple):
     @property
     def is_open(self) -> bool:
         """It would be counteracted further if it were known to be no alias."""
-        return self.can_be_alias and self.part < 1 and self.is_alias is None
+        return self.can_be_alias and self.part < 1
 
     @property
     def how_far(self) -> str:
@@ -194,7 +195,7 @@ class Advice(NamedTuple):
 
     @property
     def _worth_its_risk(self) -> bool:
-        """What the learnt design gains with the lines is at least what it loses while they are weak.
+        """In mean square, the learnt design gains with the lines at least what it loses while they are weak.
 
         A narrow line beats: of 0.015 px at 2.8 Hz hardly anything was left for half a minute, and a design that
         should have left 8 % less left 9 % more.
@@ -223,9 +224,9 @@ class Advice(NamedTuple):
     def told(self) -> list[Told]:
         """The lines of which another frame rate has shown whether they are aliases."""
         return [
-            Told(line.found.frequency_hz.value, line.is_alias)
+            Told(line.found.frequency_hz.value, line.true_hz)
             for line in self.lines
-            if line.is_alias is not None
+            if line.true_hz is not None
         ]
 
     def lines_of_text(self) -> list[str]:
@@ -391,7 +392,7 @@ def advise(
         If there is too little of it, or no design has the margins.
     """
     night, truth, told = estimated(series, rig_basis, known, others)
-    is_alias = dict(told)
+    true_hz = dict(told)
     suspects = tuple(line for line in truth.lines if can_be_alias(line, truth))
     present_stands = standing(present, truth)
     gain = _gain_for_aliases(night)
@@ -416,8 +417,8 @@ def advise(
                 found,
                 part,
                 line in suspects,
-                is_alias.get(found.frequency_hz.value),
-                both_if_aliases(present, design, truth, (line,), gain),
+                true_hz.get(found.frequency_hz.value),
+                both_if_aliases(present, design, truth, (line,) if line in suspects else (), gain),
             )
             for found, line, part in zip(night.lines, truth.lines, parts, strict=True)
         ),
@@ -468,11 +469,17 @@ def estimated(
     told = tell(night, suspects, 1 / rig_basis.period_s, known, others)
     slow_hz = tuple(one.frequency_hz for one in told if not one.is_alias)
     rig_basis = dataclasses.replace(rig_basis, slow_lines_hz=slow_hz)
+    true_hz = dict(told)
     truth = dataclasses.replace(
         rig_basis,
         noise_px=night.noise_px.value,
         air_path=night.air_path,
-        lines=tuple(line.for_design for line in night.lines),
+        lines=tuple(
+            at_frequency(
+                line.for_design, true_hz.get(line.frequency_hz.value, line.frequency_hz.value)
+            )
+            for line in night.lines
+        ),
         mirror_gain=_gain_for_design(night, rig_basis),
         overshoot=_overshoot_for_design(night),
     )
@@ -572,8 +579,10 @@ def _line_text(line: LineAdvice) -> str:
     done = f"; {line.how_far}" if line.how_far else ""
     if 0 < line.part < 1:
         done += f", as {line.part:.0%} of its RMS"
-    if line.is_alias is not None:
-        done += f"; another frame rate showed that it is {'an' if line.is_alias else 'no'} alias"
+    if line.true_hz == found.frequency_hz.value:
+        done += "; another frame rate showed that it is no alias"
+    elif line.true_hz is not None:
+        done += f"; another frame rate showed that it is an alias of {line.true_hz:.1f} Hz"
     if_alias = (
         f"\n             if it is at {fast} Hz instead: present {line.if_alias.present_px:.4f}, "
         f"learnt {line.if_alias.learnt_px:.4f} px"
@@ -608,7 +617,7 @@ def _line_numbers(line: LineAdvice) -> dict[str, Any]:
         "counteracted": line.counteracted,
         "part": line.part,
         "can_be_alias": line.can_be_alias,
-        "is_alias": line.is_alias,
+        "true_hz": line.true_hz,
         "residual_if_alias_px": {
             "present": line.if_alias.present_px,
             "learnt": line.if_alias.learnt_px,

@@ -46,8 +46,10 @@ class IfAliases(NamedTuple):
 def can_be_alias(line: Line, truth: Basis) -> bool:
     """Whether the rig may have a vibration as fast as the slowest that looks like this line.
 
-    Not if another frame rate has shown that it is none.
+    Not if another frame rate has shown that it is none, or where it is: above half the frame rate.
     """
+    if line.frequency_hz > 0.5 / truth.period_s:
+        return False
     if any(abs(line.frequency_hz - hz) <= SAME_LINE_HZ for hz in truth.slow_lines_hz):
         return False
     return 1 / truth.period_s - line.frequency_hz <= truth.fastest_line_hz
@@ -77,7 +79,13 @@ def _alias(line: Line, truth: Basis, side: int) -> Line:
     hz = rate_hz + side * line.frequency_hz
     if hz > truth.fastest_line_hz:
         hz = rate_hz - line.frequency_hz
-    return Line(hz, line.damping * line.frequency_hz / hz, line.rms_px)
+    return at_frequency(line, hz)
+
+
+def at_frequency(line: Line, frequency_hz: float) -> Line:
+    """The line elsewhere, as wide in Hz."""
+    damping = line.damping * line.frequency_hz / frequency_hz
+    return Line(frequency_hz, damping, line.rms_px)
 
 
 def both_if_aliases(
@@ -143,14 +151,14 @@ def _safe_part(line: Line, truth: Basis, present: Design, gain: float) -> float:
     """Of one line, the others expected in full; 0 where no part would leave less than leaving it alone."""
     alone = design_minimum_variance(_without((line,), truth))
     alone_px = linear_residual(alone, truth)
-    limits_px = np.maximum(*(if_aliases(one, truth, (line,), gain) for one in (alone, present)))
-    suspect = can_be_alias(line, truth)
+    suspect = (line,) if can_be_alias(line, truth) else ()
+    limits_px = np.maximum(*(if_aliases(one, truth, suspect, gain) for one in (alone, present)))
     for part in PARTS[:-1]:
         parts = tuple(part if other == line else 1.0 for other in truth.lines)
         design = design_minimum_variance(expecting(parts, truth))
         if linear_residual(design, truth) >= alone_px:
             continue
-        if not suspect or (if_aliases(design, truth, (line,), gain) <= limits_px).all():
+        if not suspect or (if_aliases(design, truth, suspect, gain) <= limits_px).all():
             return part
     return 0.0
 

@@ -38,10 +38,15 @@ _SURE = 6.0
 
 
 class Told(NamedTuple):
-    """A line, and whether it is an alias, as another frame rate has shown."""
+    """Where a line looks to be on frames, and where it is, as another frame rate has shown."""
 
     frequency_hz: float
-    is_alias: bool
+    true_hz: float
+
+    @property
+    def is_alias(self) -> bool:
+        """It is faster than it looks."""
+        return self.true_hz != self.frequency_hz
 
 
 class AtOtherRate(NamedTuple):
@@ -114,23 +119,23 @@ def tell(
     others : iterable of AtOtherRate
         What these show counts more than what was known before. Looked at while some line is not known.
     """
-    is_alias = {
-        line: one.is_alias
-        for line in lines
-        for one in known
-        if abs(one.frequency_hz - line.frequency_hz.value) <= SAME_LINE_HZ
-    }
-    for other in others if len(is_alias) < len(lines) else ():
+    true_hz: dict[LearntLine, float] = {}
+    for line in lines:
+        hz = line.frequency_hz.value
+        for one in known:
+            if abs(one.frequency_hz - hz) <= SAME_LINE_HZ:  # it may have drifted since
+                true_hz[line] = min(_true_hz(hz, rate_hz), key=lambda may: abs(may - one.true_hz))
+    for other in others if len(true_hz) < len(lines) else ():
         opened = periodograms(other.series, other.period_s, _LEAST_S)
         if opened is not None:
-            is_alias |= _shown(night, lines, opened, rate_hz)
-    return [Told(line.frequency_hz.value, is_alias[line]) for line in lines if line in is_alias]
+            true_hz |= _shown(night, lines, opened, rate_hz)
+    return [Told(line.frequency_hz.value, true_hz[line]) for line in lines if line in true_hz]
 
 
 def _shown(
     night: Night, lines: Sequence[LearntLine], opened: Opened, rate_hz: float
-) -> dict[LearntLine, bool]:
-    """The lines of which another frame rate shows surely whether they are aliases."""
+) -> dict[LearntLine, float]:
+    """The lines of which another frame rate shows surely whether they are aliases; where they are, Hz."""
     places_hz = {
         line: _places_hz(line.frequency_hz.value, rate_hz, 1 / opened.period_s) for line in lines
     }
@@ -161,21 +166,25 @@ def _shown(
     likeliest_hz = min((improved(list(begin)) for begin in begins), key=lambda end: cost(*end))
     shown = {}
     for at, line in enumerate(lines):
-        slow, *aliases = costs(at, likeliest_hz)
+        slow, *aliases = each = costs(at, likeliest_hz)
         if abs(slow - min(aliases)) >= _SURE:
-            shown[line] = slow > min(aliases)
+            shown[line] = _true_hz(line.frequency_hz.value, rate_hz)[int(np.argmin(each))]
     return shown
 
 
 def _places_hz(line_hz: float, rate_hz: float, other_hz: float) -> list[float]:
     """Where a line that is seen at `line_hz` may be seen at another rate: first if it is no alias."""
-    true_hz = [line_hz] + [
+    seen_hz = [abs(hz - round(hz / other_hz) * other_hz) for hz in _true_hz(line_hz, rate_hz)]
+    return [max(LEAST_LINE_HZ, hz) for hz in seen_hz]
+
+
+def _true_hz(line_hz: float, rate_hz: float) -> list[float]:
+    """Where a line may be that is seen at `line_hz`: first if it is no alias."""
+    return [line_hz] + [
         multiple * rate_hz + side * line_hz
         for multiple in range(1, _MULTIPLES + 1)
         for side in (-1, 1)
     ]
-    seen_hz = [abs(hz - round(hz / other_hz) * other_hz) for hz in true_hz]
-    return [max(LEAST_LINE_HZ, hz) for hz in seen_hz]
 
 
 def _cost(night: Night, seen_hz: Mapping[LearntLine, float], opened: Opened) -> float:

@@ -42,7 +42,7 @@ def test_a_line_that_stays_where_it_was_is_no_alias_and_is_counteracted_in_full(
     advice = advised(paper, fixed, shaken(paper, hz))
     (line,) = advice.lines
 
-    assert line.is_alias is False
+    assert line.true_hz == line.found.frequency_hz.value
     assert line.part == 1.0
     assert "another frame rate showed that it is no alias" in "\n".join(advice.lines_of_text())
     assert advice.rate_to_tell_hz == 0.0
@@ -54,9 +54,9 @@ def test_a_line_that_moves_is_an_alias(paper, fixed, hz):
     (line,) = advice.lines
 
     assert line.found.frequency_hz.value == pytest.approx(6.0, abs=0.1)
-    assert line.is_alias is True
-    assert line.can_be_alias
-    assert "another frame rate showed that it is an alias" in "\n".join(advice.lines_of_text())
+    assert line.true_hz == pytest.approx(hz, abs=0.2)
+    assert not line.can_be_alias  # it is one
+    assert f"that it is an alias of {line.true_hz:.1f} Hz" in "\n".join(advice.lines_of_text())
 
 
 @pytest.mark.long
@@ -64,9 +64,9 @@ def test_each_of_several_lines_is_told(paper, fixed):
     truth = shaken(paper, 4.0, 39.0)
     other_hz = rate_to_tell([4.0, 11.0], RATE_HZ)
     advice = advised(paper, fixed, truth, other_hz)
-    found = {round(line.found.frequency_hz.value): line.is_alias for line in advice.lines}
+    found = {round(line.found.frequency_hz.value): round(line.true_hz) for line in advice.lines}
 
-    assert found == {4: False, 11: True}
+    assert found == {4: 4, 11: 39}
 
 
 def test_too_few_frames_at_another_rate_tell_nothing(paper, fixed):
@@ -78,17 +78,18 @@ def test_too_few_frames_at_another_rate_tell_nothing(paper, fixed):
         [series], (0.1, 0.1), paper, fixed, others=[AtOtherRate(slower.period_s, [short])]
     )
 
-    assert advice.lines[0].is_alias is None
+    assert advice.lines[0].true_hz is None
 
 
-@pytest.mark.parametrize(("told_hz", "expected"), [(6.2, False), (5.5, None)])
-def test_what_was_told_before_counts_for_the_same_line(paper, fixed, told_hz, expected):
+@pytest.mark.parametrize(
+    ("told", "expected_hz"), [(Told(6.2, 6.2), 6), (Told(6.2, 43.8), 44), (Told(5.5, 5.5), None)]
+)
+def test_what_was_told_before_counts_for_the_same_line(paper, fixed, told, expected_hz):
     truth = shaken(paper, 6.0)
     _, series = held(truth, fixed, TWO_MINUTES_S, 5)
-    advice = advise([series], (0.1, 0.1), paper, fixed, known=[Told(told_hz, is_alias=False)])
+    advice = advise([series], (0.1, 0.1), paper, fixed, known=[told])
 
-    assert advice.lines[0].is_alias is expected
-    assert [round(one.frequency_hz) for one in advice.told] == ([] if expected is None else [6])
+    assert [round(one.true_hz) for one in advice.told] == [expected_hz] * (expected_hz is not None)
 
 
 # ---------------------------------------------------------------- asking

@@ -301,10 +301,10 @@ def test_a_design_that_would_do_harm_if_lines_are_aliases_is_not_worth_it(six_hz
 
 def test_a_design_that_loses_more_while_lines_are_weak_than_it_gains_is_not_worth_it(six_hz):
     _, advice = six_hz
-    gained = advice.shown_px[0] / advice.shown_px[1]
+    gained_px2 = advice.shown_px[0] ** 2 - advice.shown_px[1] ** 2
     found = {
-        lost: advice._replace(without_lines_px=(0.01, 0.01 * lost))
-        for lost in (0.9 * gained, 1.1 * gained)
+        part: advice._replace(without_lines_px=(0.01, math.sqrt(0.01**2 + part * gained_px2)))
+        for part in (0.9, 1.1)
     }
     kept, refused = found.values()
 
