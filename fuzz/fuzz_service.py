@@ -90,6 +90,9 @@ _VALUES = {
     "noise_px": 0.01,
     "worth_it": True,
     "fits": True,
+    "rate_to_tell_hz": 48.0,
+    "rate_hz": 48.0,
+    "duration_s": 2.0,
 }
 _RECORDER = RecorderStatus(time_s=1.0, path="x.mcap", records=5, lost=2, bytes_written=9)
 # Where a field of one command means something else.
