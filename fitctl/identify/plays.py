@@ -72,7 +72,8 @@ def place_breakpoints(at_v: Floats, bend: Floats, end_v: float, count: int = ELE
     curve evenly (de Boor, A Practical Guide to Splines, ch. III).
     """
     fine_v = np.linspace(0.0, end_v, 1001)
-    density = np.sqrt(np.interp(fine_v, at_v[1:], bend[1:]))
+    # Between a number near the least that there is and zero, rounding makes less than zero.
+    density = np.sqrt(np.maximum(0.0, np.interp(fine_v, at_v[1:], bend[1:])))
     density += max(float(density.mean()), np.finfo(float).tiny) * _LEAST_DENSITY
     share = np.append(0.0, np.cumsum((density[1:] + density[:-1]) / 2))
     # The last stands a little before the end: an element at the end would never move.

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from fitctl.identify.plays import fit_gains, model_from_ramp, place_breakpoints, trail
@@ -52,6 +52,7 @@ def test_breakpoints_are_denser_where_the_loop_bends_more():
 
 
 @given(st.lists(st.floats(0, 1e-6), min_size=6, max_size=6), st.floats(0.1, 10), st.integers(2, 20))
+@example([0.0, 0.0, 0.0, 0.0, 5e-324, 0.0], 10.0, 2)
 def test_breakpoints_always_ascend_from_zero_to_below_the_end(bend, end_v, count):
     at_v = np.arange(6) * end_v / 6
     placed = place_breakpoints(at_v, np.array(bend), end_v, count)
