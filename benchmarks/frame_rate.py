@@ -1,8 +1,8 @@
-"""What a short change of the frame rate tells of lines, and what a loop leaves that makes it by itself.
+"""What a short change of the frame rate shows of lines, and what a loop leaves that makes it by itself.
 
 Nights of one to three lines are drawn, each line slow or the alias of a slow one, and held by the linear loop
-at 50 Hz and then at the rate that a learner asks for. Printed: how many lines are told rightly, wrongly, or not
-at all. Then the whole instrument holds its star on the virtual clock, on those nights of
+at 50 Hz and then at the rate that a learner asks for. Printed: how many lines are classified rightly, wrongly,
+or not at all. Then the whole instrument holds its star on the virtual clock, on those nights of
 :mod:`benchmarks.learn_online` whose lines are slow. True residual in continuous time, of the worst axis.
 """
 
@@ -27,8 +27,7 @@ from benchmarks.linear_loop import held
 from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.basis import Line, basis
 from fitctl.controllers.design.minimum_variance import design_minimum_variance
-from fitctl.learn.aliases import SAME_LINE_HZ
-from fitctl.learn.frame_rates import AtOtherRate, rate_to_tell, tell
+from fitctl.learn.frame_rates import SAME_LINE_HZ, AtOtherRate, classify, classifying_rate
 from fitctl.learn.night import estimate
 from fitctl.learn.opened import periodograms
 from fitctl.logging.records import CAMERA, AnyRecord, Event
@@ -41,8 +40,8 @@ _LEAST_HZ, _MOST_HZ = 1.5, 20.0
 _MARGIN_S = 1.0  # of the other rate, at its ends
 
 
-def told(number: int, seed: int) -> Counter[str]:
-    """How many lines of a drawn night are told rightly, wrongly, or not."""
+def classified(number: int, seed: int) -> Counter[str]:
+    """How many lines of a drawn night are classified rightly, wrongly, or not."""
     random = Random(f"{seed}-{number}")  # noqa: S311
     paper = basis(load_rig(default_rig_path()), LOOP)
     lines, is_alias = [], {}
@@ -66,7 +65,7 @@ def told(number: int, seed: int) -> Counter[str]:
     found_hz = [line.frequency_hz.value for line in night.lines]
     if not found_hz:
         return Counter()
-    slower = dataclasses.replace(truth, period_s=1 / rate_to_tell(found_hz, 1 / paper.period_s))
+    slower = dataclasses.replace(truth, period_s=1 / classifying_rate(found_hz, 1 / paper.period_s))
     other_s = FOR_LEARNER_S - _MARGIN_S
     _, other = held(
         slower, fixed, other_s, 2 * number + 1, mirror_gain=gain, overshoot=other_overshoot
@@ -74,17 +73,17 @@ def told(number: int, seed: int) -> Counter[str]:
     shown = AtOtherRate(slower.period_s, [other])
     answers = {
         one.frequency_hz: one.is_alias
-        for one in tell(night, night.lines, 1 / paper.period_s, [], [shown])
+        for one in classify(night, night.lines, 1 / paper.period_s, [], [shown])
     }
     counted: Counter[str] = Counter()
     for hz in found_hz:
         may_be = {alias for seen, alias in is_alias.items() if abs(seen - hz) <= SAME_LINE_HZ}
         if hz not in answers:
-            counted["not told"] += 1
+            counted["not"] += 1
         elif may_be:
             counted["rightly" if answers[hz] in may_be else "wrongly"] += 1
         else:
-            counted["told of a line that is none"] += 1
+            counted["of a line that is none"] += 1
     return counted
 
 
@@ -119,9 +118,9 @@ def main() -> None:
     arguments = parser.parse_args()
     with ProcessPoolExecutor(arguments.processes) as pool:
         counted: Counter[str] = Counter()
-        for one in pool.map(partial(told, seed=arguments.seed), range(arguments.drawn)):
+        for one in pool.map(partial(classified, seed=arguments.seed), range(arguments.drawn)):
             counted += one
-        print(f"{arguments.drawn} drawn nights, lines told: {dict(counted)}", flush=True)
+        print(f"{arguments.drawn} drawn nights, lines classified: {dict(counted)}", flush=True)
         print("night | px | bound px | over bound: median, worst | other rates")
         for name in SLOW_NIGHTS:
             night = next(night for night in NIGHTS if night.name == name)

@@ -90,7 +90,7 @@ _VALUES = {
     "noise_px": 0.01,
     "worth_it": True,
     "fits": True,
-    "rate_to_tell_hz": 48.0,
+    "classifying_rate_hz": 48.0,
     "rate_hz": 48.0,
     "duration_s": 2.0,
 }

@@ -34,11 +34,11 @@ from fitctl.learn.aliases import (
     safe_parts,
 )
 from fitctl.learn.frame_rates import (
-    WORTH_TELLING,
+    WORTH_CLASSIFYING,
     AtOtherRate,
-    Told,
-    rate_to_tell,
-    tell,
+    Classified,
+    classify,
+    classifying_rate,
 )
 from fitctl.learn.intervals import Interval
 from fitctl.learn.night import LearntLine, Night, estimate
@@ -212,19 +212,19 @@ class Advice(NamedTuple):
         return learnt_px <= self._allowed(BETTER_LATELY) * present_px
 
     @property
-    def rate_to_tell_hz(self) -> float:
-        """The frame rate that would tell lines from aliases, if that is worth it; otherwise 0."""
+    def classifying_rate_hz(self) -> float:
+        """The frame rate that would distinguish lines from aliases, if that is worth it; otherwise 0."""
         open_hz = [line.found.frequency_hz.value for line in self.lines if line.is_open]
         in_part_px, in_full_px = self.expecting_px
-        if not open_hz or in_full_px > WORTH_TELLING * in_part_px:
+        if not open_hz or in_full_px > WORTH_CLASSIFYING * in_part_px:
             return 0.0
-        return rate_to_tell(open_hz, 1 / self.period_s)
+        return classifying_rate(open_hz, 1 / self.period_s)
 
     @property
-    def told(self) -> list[Told]:
+    def classified(self) -> list[Classified]:
         """The lines of which another frame rate has shown whether they are aliases."""
         return [
-            Told(line.found.frequency_hz.value, line.true_hz)
+            Classified(line.found.frequency_hz.value, line.true_hz)
             for line in self.lines
             if line.true_hz is not None
         ]
@@ -301,10 +301,10 @@ class Advice(NamedTuple):
             "             if you know how fast vibrations are at most, set fastest_line_hz: lines that are "
             "then no aliases are counteracted in full"
         ]
-        if self.rate_to_tell_hz:
+        if self.classifying_rate_hz:
             text.append(
                 "             another frame rate shows which they are, while the star is held: "
-                f"fitctl send frame-rate {self.rate_to_tell_hz:g}"
+                f"fitctl send frame-rate {self.classifying_rate_hz:g}"
             )
         return text
 
@@ -362,7 +362,7 @@ def advise(
     present: Design,
     required: Required | None = None,
     like: Design | None = None,
-    known: Sequence[Told] = (),
+    known: Sequence[Classified] = (),
     others: Sequence[AtOtherRate] = (),
 ) -> Advice:
     """Estimate a night and design for it.
@@ -381,8 +381,8 @@ def advise(
         Margins of the learnt design.
     like : Design, optional
         That was learnt from nearly the same frames: the search begins there.
-    known : sequence of Told
-        What was told of lines before.
+    known : sequence of Classified
+        What other frame rates have shown of lines before.
     others : sequence of AtOtherRate
         The loop, opened, at other frame rates.
 
@@ -391,8 +391,8 @@ def advise(
     ConfigError
         If there is too little of it, or no design has the margins.
     """
-    night, truth, told = estimated(series, rig_basis, known, others)
-    true_hz = dict(told)
+    night, truth, classified = estimated(series, rig_basis, known, others)
+    true_hz = dict(classified)
     suspects = tuple(line for line in truth.lines if can_be_alias(line, truth))
     present_stands = standing(present, truth)
     gain = _gain_for_aliases(night)
@@ -444,9 +444,9 @@ def _left(present: Design, learnt: Design, truth: Basis) -> tuple[float, float]:
 def estimated(
     series: list[Series],
     rig_basis: Basis,
-    known: Sequence[Told] = (),
+    known: Sequence[Classified] = (),
     others: Sequence[AtOtherRate] = (),
-) -> tuple[Night, Basis, list[Told]]:
+) -> tuple[Night, Basis, list[Classified]]:
     """Estimate a night, what designs count with if that is what it was like, and which lines are aliases.
 
     Arguments as of :func:`advise`.
@@ -466,10 +466,10 @@ def estimated(
         raise ConfigError(msg)
     night = estimate(opened, rig_basis.air_path, rig_basis.noise_px)
     suspects = [line for line in night.lines if can_be_alias(line.for_design, rig_basis)]
-    told = tell(night, suspects, 1 / rig_basis.period_s, known, others)
-    slow_hz = tuple(one.frequency_hz for one in told if not one.is_alias)
+    classified = classify(night, suspects, 1 / rig_basis.period_s, known, others)
+    slow_hz = tuple(one.frequency_hz for one in classified if not one.is_alias)
     rig_basis = dataclasses.replace(rig_basis, slow_lines_hz=slow_hz)
-    true_hz = dict(told)
+    true_hz = dict(classified)
     truth = dataclasses.replace(
         rig_basis,
         noise_px=night.noise_px.value,
@@ -483,7 +483,7 @@ def estimated(
         mirror_gain=_gain_for_design(night, rig_basis),
         overshoot=_overshoot_for_design(night),
     )
-    return night, truth, told
+    return night, truth, classified
 
 
 def _lately_px(

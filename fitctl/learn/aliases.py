@@ -29,8 +29,6 @@ LITTLE = 0.8
 """A design that leaves more than this part of what the present one leaves, if no line is an alias, gains too
 little for a risk: if lines are aliases, it may leave no more even with `LEAST_MOTION`."""
 LEAST_MOTION = 0.9
-SAME_LINE_HZ = 0.3
-"""A line is the one that another frame rate has shown if it is no farther from it: some drift."""
 PARTS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12, 0.08, 0.06, 0.0)
 """Of a line's RMS that a design may expect, the largest first."""
 
@@ -50,7 +48,7 @@ def can_be_alias(line: Line, truth: Basis) -> bool:
     """
     if line.frequency_hz > 0.5 / truth.period_s:
         return False
-    if any(abs(line.frequency_hz - hz) <= SAME_LINE_HZ for hz in truth.slow_lines_hz):
+    if line.frequency_hz in truth.slow_lines_hz:
         return False
     return 1 / truth.period_s - line.frequency_hz <= truth.fastest_line_hz
 

@@ -1,8 +1,8 @@
-"""Vibrations told from their aliases by a short change of the frame rate.
+"""Vibrations distinguished from their aliases by a short change of the frame rate.
 
 On frames of one rate, a vibration looks like those that are faster by a multiple of the rate, or as far below
-one. At another rate it stays where it was only if it is slower than half of both. So at the other rate the line
-is at one of a few frequencies, and the likelihoods tell at which, and how surely.
+one. At another rate a slow line stays where it was, and its aliases move, each elsewhere. So at the other rate
+the line is at one of a few frequencies, and the likelihoods show at which, and how surely.
 """
 
 from __future__ import annotations
@@ -13,22 +13,24 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
 
 from fitctl.controllers.design.linear_loop.spectrum import air_of
-from fitctl.learn.aliases import SAME_LINE_HZ
 from fitctl.learn.night import LEAST_LINE_HZ, LearntLine, Night
 from fitctl.learn.opened import Opened, Series, periodograms
 from fitctl.learn.whittle import Guess, LineGuess, likeliest
-from fitctl.loop.frame_rate import MEDIAN_OF, OTHER_RATE, off_grid
+from fitctl.loop.frame_rate import OTHER_RATE, frames_watched
 
 Floats = NDArray[np.float64]
 Rows = NDArray[np.intp]
 OTHER_RATES = (0.96, 0.95, 0.97, 0.94)
 """Of the rig's frame rate: a change to one of these, which keeps lines and possible aliases farthest apart."""
 _LEAST_S = 8.0  # at another rate: lines that are worth it show within a few seconds
-_MULTIPLES = 2  # of the frame rate, beside which aliases are looked for
-WORTH_TELLING = 0.95
+# Multiples of the frame rate beside which aliases are looked for, and beside which one that would look the same
+# keeps a line from being called slow. Exposures of some milliseconds leave little of what is faster.
+_MULTIPLES, _MORE_MULTIPLES = 2, 5
+SAME_LINE_HZ = 0.3
+"""A line is the one that was classified before if it is no farther from it: some drift."""
+WORTH_CLASSIFYING = 0.95
 """A design that expects all lines in full must leave at most this part, or another rate is not worth it."""
 _ROUNDS = 3
 _STAYS_HZ = 0.2
@@ -37,7 +39,7 @@ _SURE = 6.0
 """By how much the logarithm of the likelihood must be higher in one case: it is 400 times as likely."""
 
 
-class Told(NamedTuple):
+class Classified(NamedTuple):
     """Where a line looks to be on frames, and where it is, as another frame rate has shown."""
 
     frequency_hz: float
@@ -72,38 +74,44 @@ def by_rate(
     """
     usual: list[Rows] = []
     others: list[tuple[float, Rows]] = []
+    half = frames_watched(period_s) // 2
     for rows in pieces:
-        late = median_filter(off_grid(np.diff(exposed_s[rows]) / period_s), MEDIAN_OF)
-        is_other = np.abs(late) > OTHER_RATE
-        for run in np.split(np.arange(len(late)), np.flatnonzero(np.diff(is_other)) + 1):
+        at_s = exposed_s[rows]
+        due = np.append(0.0, np.cumsum(np.maximum(1.0, np.rint(np.diff(at_s) / period_s))))
+        first = np.maximum(0, np.arange(len(rows)) - half)
+        last = np.minimum(len(rows) - 1, np.arange(len(rows)) + half)
+        apart = np.maximum(1.0, due[last] - due[first])
+        periods = (at_s[last] - at_s[first]) / apart
+        is_other = (np.abs(periods / period_s - 1) > OTHER_RATE) & (apart >= half)
+        for run in np.split(np.arange(len(rows)), np.flatnonzero(np.diff(is_other)) + 1):
             if is_other[run[0]]:
-                others.append((period_s * float(1 + np.median(late[run])), rows[run]))
-            else:
-                usual.append(rows[run[0] : run[-1] + 2])
+                others.append((float(np.median(periods[run])), rows[run]))
+            elif len(run) > 1:
+                usual.append(rows[run])
     return usual, others
 
 
-def rate_to_tell(frequencies_hz: Sequence[float], rate_hz: float) -> float:
+def classifying_rate(frequencies_hz: Sequence[float], rate_hz: float) -> float:
     """The frame rate, Hz, at which these lines and their aliases are farthest from each other.
 
-    And from 0, where no line is told from the air.
+    And from 0, where lines and air look alike.
     """
 
     def nearest_hz(rate: float) -> float:
-        places = [_places_hz(hz, rate_hz, rate * rate_hz) for hz in frequencies_hz]
+        places = [_places_hz(hz, rate_hz, rate * rate_hz, _MORE_MULTIPLES) for hz in frequencies_hz]
         aliases = [hz for _, *others in places for hz in others]
         return min(abs(hz - away) for hz in aliases for away in (0.0, *(one[0] for one in places)))
 
     return rate_hz * max(OTHER_RATES, key=nearest_hz)
 
 
-def tell(
+def classify(
     night: Night,
     lines: Sequence[LearntLine],
     rate_hz: float,
-    known: Iterable[Told],
+    known: Sequence[Classified],
     others: Iterable[AtOtherRate],
-) -> list[Told]:
+) -> list[Classified]:
     """What is known of a night's lines, and what other frame rates show of them.
 
     Parameters
@@ -114,7 +122,7 @@ def tell(
         with those of its lines that may be aliases.
     rate_hz : float
         The rig's.
-    known : iterable of Told
+    known : sequence of Classified
         Before.
     others : iterable of AtOtherRate
         What these show counts more than what was known before. Looked at while some line is not known.
@@ -122,25 +130,27 @@ def tell(
     true_hz: dict[LearntLine, float] = {}
     for line in lines:
         hz = line.frequency_hz.value
-        for one in known:
-            if abs(one.frequency_hz - hz) <= SAME_LINE_HZ:  # it may have drifted since
-                true_hz[line] = min(_true_hz(hz, rate_hz), key=lambda may: abs(may - one.true_hz))
+        near = [one for one in known if abs(one.frequency_hz - hz) <= SAME_LINE_HZ]
+        if near:  # it may have drifted since
+            true = min(near, key=lambda one: abs(one.frequency_hz - hz)).true_hz
+            true_hz[line] = min(_true_hz(hz, rate_hz), key=lambda may: abs(may - true))
     for other in others if len(true_hz) < len(lines) else ():
         opened = periodograms(other.series, other.period_s, _LEAST_S)
         if opened is not None:
             true_hz |= _shown(night, lines, opened, rate_hz)
-    return [Told(line.frequency_hz.value, true_hz[line]) for line in lines if line in true_hz]
+    return [Classified(line.frequency_hz.value, true_hz[line]) for line in lines if line in true_hz]
 
 
 def _shown(
     night: Night, lines: Sequence[LearntLine], opened: Opened, rate_hz: float
 ) -> dict[LearntLine, float]:
     """The lines of which another frame rate shows surely whether they are aliases; where they are, Hz."""
-    places_hz = {
-        line: _places_hz(line.frequency_hz.value, rate_hz, 1 / opened.period_s) for line in lines
-    }
+    other_hz = 1 / opened.period_s
+    places_hz = {line: _places_hz(line.frequency_hz.value, rate_hz, other_hz) for line in lines}
     unsuspected_hz = {
-        line: line.frequency_hz.value for line in night.lines if line not in places_hz
+        line: _places_hz(line.frequency_hz.value, rate_hz, other_hz)[0]
+        for line in night.lines
+        if line not in places_hz
     }
 
     @functools.cache
@@ -166,23 +176,32 @@ def _shown(
     likeliest_hz = min((improved(list(begin)) for begin in begins), key=lambda end: cost(*end))
     shown = {}
     for at, line in enumerate(lines):
-        slow, *aliases = each = costs(at, likeliest_hz)
-        if abs(slow - min(aliases)) >= _SURE:
-            shown[line] = _true_hz(line.frequency_hz.value, rate_hz)[int(np.argmin(each))]
+        each, hz = costs(at, likeliest_hz), line.frequency_hz.value
+        best, second, *_ = sorted(each)
+        true_hz = _true_hz(hz, rate_hz)[int(np.argmin(each))]
+        *_, faster = np.split(
+            np.array(_places_hz(hz, rate_hz, other_hz, _MORE_MULTIPLES)), [1 + 2 * _MULTIPLES]
+        )
+        looks_slow = true_hz == hz and np.abs(faster - hz).min() <= SAME_LINE_HZ
+        if second - best >= _SURE and not looks_slow:
+            shown[line] = true_hz
     return shown
 
 
-def _places_hz(line_hz: float, rate_hz: float, other_hz: float) -> list[float]:
+def _places_hz(
+    line_hz: float, rate_hz: float, other_hz: float, multiples: int = _MULTIPLES
+) -> list[float]:
     """Where a line that is seen at `line_hz` may be seen at another rate: first if it is no alias."""
-    seen_hz = [abs(hz - round(hz / other_hz) * other_hz) for hz in _true_hz(line_hz, rate_hz)]
+    true_hz = _true_hz(line_hz, rate_hz, multiples)
+    seen_hz = [abs(hz - round(hz / other_hz) * other_hz) for hz in true_hz]
     return [max(LEAST_LINE_HZ, hz) for hz in seen_hz]
 
 
-def _true_hz(line_hz: float, rate_hz: float) -> list[float]:
+def _true_hz(line_hz: float, rate_hz: float, multiples: int = _MULTIPLES) -> list[float]:
     """Where a line may be that is seen at `line_hz`: first if it is no alias."""
     return [line_hz] + [
         multiple * rate_hz + side * line_hz
-        for multiple in range(1, _MULTIPLES + 1)
+        for multiple in range(1, multiples + 1)
         for side in (-1, 1)
     ]
 

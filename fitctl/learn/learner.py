@@ -20,7 +20,7 @@ from fitctl.controllers.design.theory import loop_theory
 from fitctl.controllers.pair import Design
 from fitctl.error_budget import pieces_of
 from fitctl.learn.advice import Advice, advise
-from fitctl.learn.frame_rates import AtOtherRate, Told, by_rate
+from fitctl.learn.frame_rates import SAME_LINE_HZ, AtOtherRate, Classified, by_rate
 from fitctl.learn.opened import LEAST_S, rebuild
 from fitctl.logging.records import Tick
 from fitctl.loop.learning import has_moved
@@ -91,7 +91,7 @@ class Learner:
         self._design = ""
         self._since_s = 0.0
         self._learnt: Design | None = None  # last
-        self._told: list[Told] = []
+        self._classified: list[Classified] = []
 
     def watch(self, design: str, now_s: float) -> None:
         """The design in force now, by its key."""
@@ -108,6 +108,7 @@ class Learner:
         elif tick.number >= 0 and tick.star_visible and tick.time_s - self._unsettled_s >= SETTLE_S:
             if tick.time_s - self._last_s > WINDOW_S:
                 self._added = self._new = 0
+                self._classified = []
                 self._due_after = self._first
             self._last_s = tick.time_s
             row = self._added % len(self._ring)
@@ -171,10 +172,17 @@ class Learner:
             basis(self._rig, self._loop_name),
             present,
             like=self._learnt,
-            known=self._told,
+            known=self._classified,
             others=[AtOtherRate(s, rebuild(theory, ticks, [rows])) for s, rows in others],
         )
-        self._learnt, self._told = advice.design, advice.told
+        self._learnt = advice.design
+        found = [one.frequency_hz for one in advice.classified]
+        # A line that is weak for a while is not found, and is the same when it comes back.
+        self._classified = advice.classified + [
+            one
+            for one in self._classified
+            if all(abs(one.frequency_hz - hz) > SAME_LINE_HZ for hz in found)
+        ]
         if math.isinf(advice.present.residual_px):
             msg = (
                 f"learn: the mirror moves by {advice.night.mirror_gain} of what the rig file predicts, and the "
@@ -197,7 +205,7 @@ class Learner:
             noise_px=advice.night.noise_px.value,
             worth_it=advice.worth_it,
             fits=advice.night.test.fits,
-            rate_to_tell_hz=advice.rate_to_tell_hz,
+            classifying_rate_hz=advice.classifying_rate_hz,
         )
 
 

@@ -49,7 +49,7 @@ class LearntLine(NamedTuple):
     rms_px : tuple of Interval
         For each axis.
     aliases_hz : tuple of float
-        Faster lines that look the same on frames: only another frame rate tells them apart.
+        Faster lines that look the same on frames: only another frame rate distinguishes them.
     """
 
     frequency_hz: Interval

@@ -1,24 +1,17 @@
-"""Whether frames come at the rig file's rate: a short change of it tells vibrations from their aliases."""
+"""Whether frames come at the rig file's rate; a short change of it distinguishes vibrations from aliases."""
 
 from __future__ import annotations
 
-import math
-import statistics
 from collections import deque
 
-import numpy as np
-from numpy.typing import NDArray
-
-Floats = NDArray[np.float64]
-OTHER_RATE = 0.015
-"""Of the frame period: from so much on, frames come at another rate. Cameras keep theirs to a thousandth."""
-MEDIAN_OF = 15
-"""Intervals whose median counts: a missing frame, or one that is dated wrongly, is no other rate."""
+OTHER_RATE = 0.018
+"""Of the frame period: from so much on, frames come at another rate. A change is at least 0.02."""
+_LEAST_FRAMES, _WATCHED_S = 15, 0.3
 
 
-def off_grid(apart: Floats) -> Floats:
-    """By how much frames are later than multiples of the frame period, all in frame periods, shape as given."""
-    return np.asarray(apart - np.maximum(1.0, np.rint(apart)))
+def frames_watched(period_s: float) -> int:
+    """Over so many frames their rate is measured: jitter of single dates must not count."""
+    return max(_LEAST_FRAMES, round(_WATCHED_S / period_s))
 
 
 class RateWatch:
@@ -32,13 +25,19 @@ class RateWatch:
 
     def __init__(self, period_s: float) -> None:
         self._period_s = period_s
-        self._last_s = math.nan
-        self._off: deque[float] = deque(maxlen=MEDIAN_OF)
+        self._frames = frames_watched(period_s)
+        # When frames were exposed, and how many periods were due until then, missing frames included.
+        self._seen: deque[tuple[float, int]] = deque(maxlen=self._frames + 1)
 
     def is_other(self, exposed_s: float) -> bool:
         """Take the next frame's mid-exposure; whether frames come at another rate now."""
-        apart = (exposed_s - self._last_s) / self._period_s
-        self._last_s = exposed_s
-        if not math.isnan(apart):
-            self._off.append(apart - max(1, round(apart)))
-        return bool(self._off) and abs(statistics.median(self._off)) > OTHER_RATE
+        seen, due = self._seen, 0
+        if seen:
+            last_s, due = seen[-1]
+            due += max(1, round((exposed_s - last_s) / self._period_s))
+        seen.append((exposed_s, due))
+        first_s, first_due = seen[0]
+        if due - first_due < self._frames:
+            return False
+        apart = (exposed_s - first_s) / self._period_s
+        return abs(apart / (due - first_due) - 1) > OTHER_RATE

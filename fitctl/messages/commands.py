@@ -142,7 +142,7 @@ class MoveCollector(Command, frozen=True, kw_only=True):
 
 
 class FrameRate(Command, frozen=True, kw_only=True):
-    """Run the camera slower for a while, so that vibrations can be told from their aliases.
+    """Run the camera slower for a while, to distinguish vibrations from aliases.
 
     Then it runs as the rig file says again.
     """
@@ -204,8 +204,8 @@ class LearnerReport(Command, frozen=True, kw_only=True):
         The learnt design leaves clearly less; much less where the model does not fit the frames.
     fits : bool
         The model fits the frames.
-    rate_to_tell_hz : float
-        The frame rate at which lines could be told from aliases, where that is worth it.
+    classifying_rate_hz : float
+        The frame rate that distinguishes lines from aliases, where that is worth it.
     """
 
     design_json: str
@@ -219,7 +219,7 @@ class LearnerReport(Command, frozen=True, kw_only=True):
     noise_px: float = 0.0
     worth_it: bool = False
     fits: bool = True
-    rate_to_tell_hz: float = 0.0
+    classifying_rate_hz: float = 0.0
 
 
 class SequenceStatus(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):

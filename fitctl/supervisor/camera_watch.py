@@ -50,10 +50,12 @@ class CameraWatch:
         self._last_frame_s = clock.now_s()
 
     def begin(self, *, opened: bool) -> None:
-        """Devices were opened just now, and perhaps it among them; otherwise it should still be well."""
+        """Devices were opened just now; if not the camera, it has been open all the time, or has failed."""
+        if not opened:
+            return
         self.ready = True
         self.skipped = 0
-        self.opened += opened
+        self.opened += 1
         self._last_frame_s = self._clock.now_s()
 
     def next_frame(self, meanwhile: Callable[[], float]) -> Frame | None:

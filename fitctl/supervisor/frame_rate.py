@@ -18,14 +18,14 @@ LONGEST_S = 120.0
 FOR_LEARNER_S = 12.0
 """So long for the learner: designs made for the usual rate leave more of a line meanwhile;"""
 PAUSE_S, MOST_PAUSE_S = 120.0, 7680.0
-"""and not again for so long; twice as long each time."""
+"""then not again for so long, and for twice as long after each further change."""
 
 
 class FrameRateChange:
     """Has the camera run at another rate, and at the rig file's again when the time is over.
 
-    The camera is asked beside the ticks. Where its rate is not known for sure, and cannot be set to the rig
-    file's, the camera has failed.
+    The camera is asked beside the ticks. If its rate is not known for sure, and cannot be set to the rig file's
+    for as long as its control lasts without a sign of life, the camera has failed.
 
     Parameters
     ----------
@@ -60,8 +60,11 @@ class FrameRateChange:
         self._wanted_hz = self._rate_hz
         self._duration_s = 0.0
         self._until_s = math.inf  # since the other rate is in force
+        self._patience_s = rig.camera.device.heartbeat_s
+        self._back_from_s = math.inf  # since when the usual rate is being set
         self._opened = -1  # which opening of the camera this belongs to
         self._learner_from_s, self._pause_s = -math.inf, PAUSE_S
+        self._paused_for = -1  # which opening of the camera the pause belongs to
 
     @property
     def active(self) -> bool:
@@ -88,8 +91,14 @@ class FrameRateChange:
         self._set(rate_hz)
 
     def for_learner(self, rate_hz: float) -> None:
-        """Change the rate so that lines are told from aliases, unless that was done lately; 0 is no rate."""
+        """Change the rate for a learner, unless that was done lately; 0 is no rate."""
         now_s = self._clock.now_s()
+        if self._paused_for != self._watch.opened:
+            self._paused_for, self._pause_s, self._learner_from_s = (
+                self._watch.opened,
+                PAUSE_S,
+                -math.inf,
+            )
         if not rate_hz or now_s < self._learner_from_s or self.why_not(rate_hz, FOR_LEARNER_S):
             return
         self._learner_from_s = now_s + self._pause_s
@@ -118,11 +127,14 @@ class FrameRateChange:
 
     def _answered(self, error: Exception | None) -> None:
         now_hz, usual_hz = self._wanted_hz, self._rate_hz
-        if now_hz == usual_hz:
+        if now_hz == usual_hz and error is None:
             self._opened = -1
-            if error is None:
-                self._journal.event("info", CAMERA, f"runs at {usual_hz:g} Hz again")
+            self._journal.event("info", CAMERA, f"runs at {usual_hz:g} Hz again")
+        elif now_hz == usual_hz and error is not None:
+            if self._clock.now_s() - self._back_from_s < self._patience_s:
+                self._job = self._executor.submit(self._camera.set_frame_rate, usual_hz)
             else:
+                self._opened = -1
                 self._failed(error)
         elif error is None:
             self._until_s = min(self._until_s, self._clock.now_s() + self._duration_s)
@@ -138,5 +150,5 @@ class FrameRateChange:
             self._set(usual_hz)
 
     def _set(self, rate_hz: float) -> None:
-        self._wanted_hz = rate_hz
+        self._wanted_hz, self._back_from_s = rate_hz, self._clock.now_s()
         self._job = self._executor.submit(self._camera.set_frame_rate, rate_hz)

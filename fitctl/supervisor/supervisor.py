@@ -86,6 +86,7 @@ _COMMANDS: dict[type[AnyCommand], Trigger] = {
     Off: Trigger.OFF,
 }
 _POWER_UP = {Trigger.STANDBY, Trigger.RECOVER}
+_ASKED_LATELY_S = 20.0  # by a learner; its next report comes after 30 s
 MakeLoop = Callable[[str, Rig, LoopDevices, Journal, Designer], Loop]
 
 
@@ -193,6 +194,7 @@ class Supervisor:
             if rig.collector is not None and devices.hexapod is not None
             else None
         )
+        self._asked_rates: dict[str, tuple[float, float]] = {}  # by loop: which, and when
         self._rig_commands: dict[type[AnyCommand], Callable[[Any], str]] = {
             MoveCollector: self._move_collector,
             FrameRate: self._change_frame_rate,
@@ -422,6 +424,8 @@ class Supervisor:
             case SetController():
                 return self._design_jobs.begin(command, names)
             case SequenceReport():
+                if not self.sequences.under_way:
+                    self._frame_rate.end()
                 return self.sequences.report(command.status)
             case SequenceControl():
                 return self.sequences.control(command.action)
@@ -431,9 +435,7 @@ class Supervisor:
                 why_not = self._rig_commands[type(command)](command)
                 return _refusal(why_not) if why_not else Reply(accepted=True)
             case _ if type(command) in LOOP_COMMANDS:
-                why_not = obey_loop_command(self.rig, [self.loops[name] for name in names], command)
-                if isinstance(command, Experiment) and not why_not:
-                    self._frame_rate.end()
+                why_not = self._obey_for_loops(command, names)
             case _:
                 why_not = f"{type(command).__name__} is not for the supervisor"
         return _refusal(why_not) if why_not else self._begin(command, names)
@@ -443,12 +445,24 @@ class Supervisor:
             return "the rig has no collector that moves"
         return self.collector.obey(command)
 
-    def _change_frame_rate(self, command: FrameRate) -> str:
+    def _obey_for_loops(self, command: AnyCommand, names: list[str]) -> str:
+        if isinstance(command, Experiment) and self._frame_rate.active:
+            self._frame_rate.end()
+            if self._device_jobs.busy:  # and so the camera waits
+                return "the camera's usual rate is being set; try again"
+        return obey_loop_command(self.rig, [self.loops[name] for name in names], command)
+
+    def _why_no_other_rate(self) -> str:
         if self._device_jobs.busy:
             return "devices are being opened or closed; wait for the event that reports the end"
         if any(loop.mode is Mode.EXPERIMENT for loop in self.loops.values()):
             return "an experiment needs the rig's frame rate; wait for its end"
-        why_not = self._frame_rate.why_not(command.rate_hz, command.duration_s)
+        return ""
+
+    def _change_frame_rate(self, command: FrameRate) -> str:
+        why_not = self._why_no_other_rate() or self._frame_rate.why_not(
+            command.rate_hz, command.duration_s
+        )
         if not why_not:
             self._frame_rate.begin(command.rate_hz, command.duration_s)
         return why_not
@@ -509,6 +523,7 @@ class Supervisor:
         if why_not:
             return _refusal(why_not)
         self._design_jobs.learn(loop, report)
+        self._asked_rates[loop.name] = (report.classifying_rate_hz, self._clock.now_s())
         return Reply(accepted=True)
 
     # ------------------------------------------------------------ beside the ticks
@@ -537,7 +552,7 @@ class Supervisor:
 
     def _once_a_second(self) -> None:
         now_s = self._reported_s = self._clock.now_s()
-        self._tell_lines(now_s)
+        self._change_rate_for_learner(now_s)
         # Nothing is timed while devices are let go or being opened: imports and parsing hold everything.
         if not self._device_jobs.busy:
             self._timing.report(
@@ -564,14 +579,14 @@ class Supervisor:
         if self.collector is not None and (self.collector.is_open or self.collector.error):
             self._record(hexapod_health(self.collector, now_s))
 
-    def _tell_lines(self, now_s: float) -> None:
-        """Change the frame rate for a learner that asks for it, once its design is in use."""
-        if self._device_jobs.busy or self._design_jobs.busy or self.sequences.under_way:
+    def _change_rate_for_learner(self, now_s: float) -> None:
+        """Change the frame rate if a learner has asked for it lately, once its design is in use."""
+        if self._design_jobs.busy or self.sequences.under_way or self._why_no_other_rate():
             return
-        for loop in self.stellar_loops.values():
-            report = loop.learning.report
-            if report is not None and loop.learning.may_act(now_s):
-                self._frame_rate.for_learner(report.rate_to_tell_hz)
+        for name, (rate_hz, asked_s) in self._asked_rates.items():
+            learning = self.stellar_loops[name].learning
+            if now_s - asked_s <= _ASKED_LATELY_S and learning.may_act(now_s):
+                self._frame_rate.for_learner(rate_hz)
 
     def _timed(self, record: LoopTiming) -> None:
         self.loops[record.loop].quantities.record_timing(record)

@@ -11,9 +11,9 @@ from fitctl.learn.advice import advise
 from fitctl.learn.frame_rates import (
     OTHER_RATES,
     AtOtherRate,
-    Told,
+    Classified,
     by_rate,
-    rate_to_tell,
+    classifying_rate,
 )
 
 TWO_MINUTES_S, OTHER_S = 120.0, 11.0
@@ -39,13 +39,13 @@ def advised(paper, fixed, truth, other_hz=OTHER_HZ, **options):
 
 @pytest.mark.parametrize("hz", [4.0, 6.0, 14.0])
 def test_a_line_that_stays_where_it_was_is_no_alias_and_is_counteracted_in_full(paper, fixed, hz):
-    advice = advised(paper, fixed, shaken(paper, hz))
+    advice = advised(paper, fixed, shaken(paper, hz), classifying_rate([hz], RATE_HZ))
     (line,) = advice.lines
 
     assert line.true_hz == line.found.frequency_hz.value
     assert line.part == 1.0
     assert "another frame rate showed that it is no alias" in "\n".join(advice.lines_of_text())
-    assert advice.rate_to_tell_hz == 0.0
+    assert advice.classifying_rate_hz == 0.0
 
 
 @pytest.mark.parametrize("hz", [44.0, 56.0, 94.0])
@@ -62,11 +62,19 @@ def test_a_line_that_moves_is_an_alias(paper, fixed, hz):
 @pytest.mark.long
 def test_each_of_several_lines_is_told(paper, fixed):
     truth = shaken(paper, 4.0, 39.0)
-    other_hz = rate_to_tell([4.0, 11.0], RATE_HZ)
+    other_hz = classifying_rate([4.0, 11.0], RATE_HZ)
     advice = advised(paper, fixed, truth, other_hz)
     found = {round(line.found.frequency_hz.value): round(line.true_hz) for line in advice.lines}
 
     assert found == {4: 4, 11: 39}
+
+
+def test_a_line_is_not_called_slow_where_a_faster_one_would_stay_too(paper, fixed):
+    """196 Hz looks like 4 Hz at both rates."""
+    advice = advised(paper, fixed, shaken(paper, 4.0), 48.0)
+
+    assert advice.lines[0].true_hz is None
+    assert classifying_rate([4.0], RATE_HZ) != 48.0
 
 
 def test_too_few_frames_at_another_rate_tell_nothing(paper, fixed):
@@ -82,14 +90,17 @@ def test_too_few_frames_at_another_rate_tell_nothing(paper, fixed):
 
 
 @pytest.mark.parametrize(
-    ("told", "expected_hz"), [(Told(6.2, 6.2), 6), (Told(6.2, 43.8), 44), (Told(5.5, 5.5), None)]
+    ("told", "expected_hz"),
+    [(Classified(6.2, 6.2), 6), (Classified(6.2, 43.8), 44), (Classified(5.5, 5.5), None)],
 )
 def test_what_was_told_before_counts_for_the_same_line(paper, fixed, told, expected_hz):
     truth = shaken(paper, 6.0)
     _, series = held(truth, fixed, TWO_MINUTES_S, 5)
     advice = advise([series], (0.1, 0.1), paper, fixed, known=[told])
 
-    assert [round(one.true_hz) for one in advice.told] == [expected_hz] * (expected_hz is not None)
+    assert [round(one.true_hz) for one in advice.classified] == [expected_hz] * (
+        expected_hz is not None
+    )
 
 
 # ---------------------------------------------------------------- asking
@@ -102,23 +113,23 @@ def test_a_line_that_is_counteracted_in_part_is_worth_another_rate(paper, fixed)
     text = "\n".join(advice.lines_of_text())
 
     assert advice.lines[0].part < 1
-    assert advice.rate_to_tell_hz in {part * RATE_HZ for part in OTHER_RATES}
-    assert f"fitctl send frame-rate {advice.rate_to_tell_hz:g}" in text
+    assert advice.classifying_rate_hz in {part * RATE_HZ for part in OTHER_RATES}
+    assert f"fitctl send frame-rate {advice.classifying_rate_hz:g}" in text
 
 
 def test_a_night_without_lines_asks_for_nothing(paper, fixed):
     _, series = held(paper, fixed, TWO_MINUTES_S, 5)
     advice = advise([series], (0.0, 0.0), paper, fixed)
 
-    assert advice.rate_to_tell_hz == 0.0
+    assert advice.classifying_rate_hz == 0.0
     assert "frame-rate" not in "\n".join(advice.lines_of_text())
 
 
 def test_the_rate_keeps_lines_away_from_what_others_would_be_as_aliases():
-    at_hz = rate_to_tell([6.0, 8.0], RATE_HZ)  # with 48 Hz, the alias of 8 Hz would be at 6 Hz
+    at_hz = classifying_rate([6.0, 8.0], RATE_HZ)  # with 48 Hz, the alias of 8 Hz would be at 6 Hz
 
     assert at_hz != 0.96 * RATE_HZ
-    assert rate_to_tell([60.0, 140.0], 500.0) in {part * 500.0 for part in OTHER_RATES}
+    assert classifying_rate([60.0, 140.0], 500.0) in {part * 500.0 for part in OTHER_RATES}
 
 
 # ---------------------------------------------------------------- which frames

@@ -246,7 +246,7 @@ def another_frame_rate(simulation):
     simulation.run(3.0)
     assert simulation.command(FrameRate(rate_hz=48.0, duration_s=2.0)).accepted
     simulation.run(6.0)
-    simulation.command(learner_report(worth_it=False, rate_to_tell_hz=47.0))
+    simulation.command(learner_report(worth_it=False, classifying_rate_hz=47.0))
     simulation.run(3.0)
     assert simulation.camera._period_s == 1 / 47.0
     simulation.command(Experiment(loop="right", name="try", drives=SCAN))

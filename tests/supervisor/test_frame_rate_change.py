@@ -15,6 +15,7 @@ from fitctl.messages.commands import (
     Off,
     SequenceReport,
     SequenceStatus,
+    SetTarget,
     Standby,
     Stop,
 )
@@ -186,16 +187,28 @@ def test_a_camera_that_cannot_be_set_back_has_failed(held):
     assert why_not(held, rate_hz=48.0, duration_s=2.0) == ""
     held.run(1.0)
     held.camera.set_frame_rate = failing(SILENT)
-    held.run(2.0)
+    held.run(2.0 + held.rig.camera.device.heartbeat_s)
 
     assert held.ticks[-1].mode == "SAFE"
+
+
+def test_a_camera_that_does_not_answer_for_a_moment_is_set_back_then(held):
+    assert why_not(held, rate_hz=48.0, duration_s=2.0) == ""
+    held.run(1.0)
+    change, held.camera.set_frame_rate = held.camera.set_frame_rate, failing(SILENT)
+    held.run(2.0)
+    held.camera.set_frame_rate = change
+    held.run(1.0)
+
+    assert held.ticks[-1].mode == "VERNIER"
+    assert period_s(held) == pytest.approx(USUAL_S)
 
 
 # ---------------------------------------------------------------- for the learner
 
 
 def test_the_learner_gets_its_rate_once_and_later_again(held):
-    wish = report(worth_it=False, rate_to_tell_hz=48.0)
+    wish = report(worth_it=False, classifying_rate_hz=48.0)
     assert held.command(wish).accepted
     held.run(2.0)
     assert period_s(held) == pytest.approx(OTHER_S)
@@ -207,7 +220,7 @@ def test_the_learner_gets_its_rate_once_and_later_again(held):
 
 
 def test_a_design_that_is_worth_it_comes_before_another_rate(held):
-    held.command(report(rate_to_tell_hz=48.0))
+    held.command(report(classifying_rate_hz=48.0))
     held.run(3.0)
     change, rate = (
         next(record.time_s for record in held.records if isinstance(record, kind) and is_it(record))
@@ -222,25 +235,58 @@ def test_a_design_that_is_worth_it_comes_before_another_rate(held):
 
 @pytest.mark.long
 def test_after_a_pause_the_learner_gets_its_rate_again(held):
-    wish = report(worth_it=False, rate_to_tell_hz=48.0)
+    wish = report(worth_it=False, classifying_rate_hz=48.0)
     held.command(wish)
-    held.run(PAUSE_S + 4.0)
+    held.run(PAUSE_S)
+    held.command(wish)
+    held.run(4.0)
 
     assert period_s(held) == pytest.approx(OTHER_S)
 
 
 @pytest.mark.parametrize("wish_hz", [0.0, 10.0, 50.0, float("nan")])
 def test_a_rate_that_cannot_be_is_no_wish(held, wish_hz):
-    assert held.command(report(worth_it=False, rate_to_tell_hz=wish_hz)).accepted
+    assert held.command(report(worth_it=False, classifying_rate_hz=wish_hz)).accepted
     held.run(2.0)
 
     assert period_s(held) == pytest.approx(USUAL_S)
 
 
+def test_a_wish_of_long_ago_is_forgotten(held):
+    held.command(SetTarget(az_px=22.0, el_px=19.5, loop="right"))
+    held.command(report(worth_it=False, classifying_rate_hz=48.0))
+    for target_px in np.linspace(22.0, 24.0, 30):  # the loop is never calm meanwhile
+        held.command(SetTarget(az_px=float(target_px), el_px=19.5, loop="right"))
+        held.run(1.0)
+    held.run(5.0)
+
+    assert period_s(held) == pytest.approx(USUAL_S)
+
+
+def test_a_sequence_that_begins_ends_the_change(held):
+    assert why_not(held, rate_hz=48.0, duration_s=60.0) == ""
+    held.run(1.0)
+    status = SequenceStatus(run="1", name="night", state="running", steps=3)
+    assert held.command(SequenceReport(status=status)).accepted
+    held.run(1.0)
+
+    assert period_s(held) == pytest.approx(USUAL_S)
+
+
+def test_an_experiment_of_another_loop_keeps_the_rigs_rate(held_pair):
+    for loop in ("right", "left"):
+        held_pair.command(Standby(loop=loop))
+        held_pair.run(1.0)
+    supervisor = held_pair.supervisor
+    supervisor.loops["left"].mode = Mode.EXPERIMENT
+
+    assert "an experiment needs the rig's frame rate" in supervisor._why_no_other_rate()
+
+
 def test_a_sequence_keeps_the_rigs_rate(held):
     status = SequenceStatus(run="1", name="night", state="running", steps=3)
     assert held.command(SequenceReport(status=status)).accepted
-    held.command(report(worth_it=False, rate_to_tell_hz=48.0))
+    held.command(report(worth_it=False, classifying_rate_hz=48.0))
     held.run(2.0)
 
     assert period_s(held) == pytest.approx(USUAL_S)
@@ -252,7 +298,7 @@ def test_with_advice_alone_the_rate_stays():
         assert simulation.command(command).accepted
     until(simulation, Mode.VERNIER)
     simulation.run(5.0)
-    simulation.command(report(worth_it=False, rate_to_tell_hz=48.0))
+    simulation.command(report(worth_it=False, classifying_rate_hz=48.0))
     simulation.run(2.0)
 
     assert period_s(simulation) == pytest.approx(USUAL_S)

@@ -166,13 +166,18 @@ class AravisCamera:
             If it has taken another.
         """
         self._opened()
+        with self._translated("the frame rate to be readable"):
+            before_hz = self._device.get_frame_rate()
+        refusal = ""
         try:
             with self._translated("another frame rate"):
                 self._device.set_frame_rate(rate_hz)
         except DeviceMismatch as error:
-            raise refused_rate(self._endpoint, rate_hz, error.got) from error
+            refusal = error.got
         with self._translated("the frame rate to be readable"):
             actual_hz = self._device.get_frame_rate()
+        if refusal and actual_hz == before_hz:
+            raise refused_rate(self._endpoint, rate_hz, refusal)
         self._expect("frame rate", rate_hz, actual_hz, RATE_TOLERANCE)
 
     def counts(self) -> CameraCounts:

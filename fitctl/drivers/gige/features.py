@@ -142,7 +142,11 @@ class Features:
             self._set(rate, rate_hz)
         except DeviceMismatch as error:
             raise refused_rate(self._endpoint, rate_hz, error.got) from error
-        self._expect(rate, rate_hz, self.value(rate), RATE_TOLERANCE)
+        try:
+            actual_hz = self.value(rate)
+        except DeviceRefused as error:  # of the read: the rate may have changed
+            raise self._mismatch(f"{rate} to be readable", error.got) from error
+        self._expect(rate, rate_hz, actual_hz, RATE_TOLERANCE)
 
     def first_of(self, names: tuple[str, ...]) -> str | None:
         """Which of a feature's names the camera knows; None where it knows none."""

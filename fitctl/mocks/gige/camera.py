@@ -28,7 +28,7 @@ class GigeCameraMock:
 
     Known limitations: Mono8, Mono12 (unpacked) and Mono16 only; no events, actions, message channel,
     PENDING_ACK, chunk data, binning, automatic exposure, several frames by one start, or extended ids;
-    FORCEIP can ask for no other address than it has; format, exposure, rate, gain and trigger are
+    FORCEIP can ask for no other address than it has; format, exposure, gain and trigger are
     locked while it runs; the don't-fragment flag is kept and has no effect; without an inter-packet
     delay a frame is sent in one go; the image is that of one instant, not blurred by the exposure; the
     stream goes to loopback addresses only, and broadcasts are heard on the loopback interface only;
