@@ -22,7 +22,7 @@ from random import Random
 import numpy as np
 
 from benchmarks.learn import LOOP
-from benchmarks.learn_online import BEGIN_S, CONTROLLER, END_S, NIGHTS, bound_px
+from benchmarks.learn_online import BEGIN_S, CONTROLLER, END_S, NIGHTS, Night, bound_px
 from benchmarks.linear_loop import held
 from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.basis import Line, basis
@@ -35,14 +35,15 @@ from fitctl.simulation.simulation import Simulation
 from fitctl.simulation.statistics import true_residual_rms
 from fitctl.supervisor.frame_rate import FOR_LEARNER_S
 
-SLOW_NIGHTS = ("6 Hz, 0.05 px", "6 Hz, 0.05 px, fit", "3.1, 8.7, 14 Hz, 0.02 px")
+_SLOW = ("6 Hz, 0.05 px", "6 Hz, 0.05 px, fit", "3.1, 8.7, 14 Hz, 0.02 px")
+SLOW_NIGHTS = [night for night in NIGHTS if night.name in _SLOW]
 _LEAST_HZ, _MOST_HZ = 1.5, 20.0
 _MARGIN_S = 1.0  # of the other rate, at its ends
 
 
 def classified(number: int, seed: int) -> Counter[str]:
     """How many lines of a drawn night are classified rightly, wrongly, or not."""
-    random = Random(f"{seed}-{number}")  # noqa: S311
+    random = Random(f"{seed}-{number}")  # noqa: S311 - a repeatable draw
     paper = basis(load_rig(default_rig_path()), LOOP)
     lines, is_alias = [], {}
     for _ in range(random.choice((1, 2, 3))):
@@ -87,9 +88,8 @@ def classified(number: int, seed: int) -> Counter[str]:
     return counted
 
 
-def left(name: str, seed: int) -> tuple[float, int]:
+def left(night: Night, seed: int) -> tuple[float, int]:
     """What a loop leaves of a night, px, and how often the camera ran at another rate."""
-    night = next(night for night in NIGHTS if night.name == name)
     rig = load_rig(
         default_rig_path(), [CONTROLLER, *night.known, *night.unknown, f"loops.{LOOP}.learn=on"]
     )
@@ -122,14 +122,13 @@ def main() -> None:
             counted += one
         print(f"{arguments.drawn} drawn nights, lines classified: {dict(counted)}", flush=True)
         print("night | px | bound px | over bound: median, worst | other rates")
-        for name in SLOW_NIGHTS:
-            night = next(night for night in NIGHTS if night.name == name)
-            ends = list(pool.map(partial(left, name), range(arguments.seeds)))
+        for night in SLOW_NIGHTS:
+            ends = list(pool.map(partial(left, night), range(arguments.seeds)))
             if not ends:
                 continue
             px, least_px = np.array([px for px, _ in ends]), bound_px(night)
             print(
-                f"{name} | {px.mean():.4f} | {least_px:.4f} | {np.median(px) / least_px:.3f}, "
+                f"{night.name} | {px.mean():.4f} | {least_px:.4f} | {np.median(px) / least_px:.3f}, "
                 f"{px.max() / least_px:.3f} | {sum(times for _, times in ends)}",
                 flush=True,
             )

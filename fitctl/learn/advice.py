@@ -149,10 +149,8 @@ class Advice(NamedTuple):
         The same without lines.
     filled : int
         Frames that are missing, or that a late command met.
-    expecting_px : tuple of float
-        Residual of designs without margins that expect the lines as the learnt one does, and in full.
-    period_s : float
-        Of frames.
+    classifying_rate_hz : float
+        The frame rate that would distinguish lines from aliases, if that is worth it; otherwise 0.
     """
 
     night: Night
@@ -168,8 +166,7 @@ class Advice(NamedTuple):
     shown_px: tuple[float, float]
     without_lines_px: tuple[float, float]
     filled: int
-    expecting_px: tuple[float, float]
-    period_s: float
+    classifying_rate_hz: float
 
     @property
     def worth_it(self) -> bool:
@@ -210,15 +207,6 @@ class Advice(NamedTuple):
     def _better_lately(self) -> bool:
         present_px, learnt_px = self.lately_px
         return learnt_px <= self._allowed(BETTER_LATELY) * present_px
-
-    @property
-    def classifying_rate_hz(self) -> float:
-        """The frame rate that would distinguish lines from aliases, if that is worth it; otherwise 0."""
-        open_hz = [line.found.frequency_hz.value for line in self.lines if line.is_open]
-        in_part_px, in_full_px = self.expecting_px
-        if not open_hz or in_full_px > WORTH_CLASSIFYING * in_part_px:
-            return 0.0
-        return classifying_rate(open_hz, 1 / self.period_s)
 
     @property
     def classified(self) -> list[Classified]:
@@ -403,6 +391,16 @@ def advise(
         if_aliases = both_if_aliases(present, design, truth, suspects, gain)
         if if_aliases.harmless or learnt_stands.residual_px > WORTH_IT * present_stands.residual_px:
             break
+    lines = tuple(
+        LineAdvice(
+            found,
+            part,
+            line in suspects,
+            true_hz.get(found.frequency_hz.value),
+            both_if_aliases(present, design, truth, (line,) if line in suspects else (), gain),
+        )
+        for found, line, part in zip(night.lines, truth.lines, parts, strict=True)
+    )
     return Advice(
         night=night,
         measured_px=measured_px,
@@ -412,28 +410,30 @@ def advise(
         more_writes_px=bound(
             dataclasses.replace(truth, writes=max(MORE_WRITES, truth.writes))
         ).residual_px,
-        lines=tuple(
-            LineAdvice(
-                found,
-                part,
-                line in suspects,
-                true_hz.get(found.frequency_hz.value),
-                both_if_aliases(present, design, truth, (line,) if line in suspects else (), gain),
-            )
-            for found, line, part in zip(night.lines, truth.lines, parts, strict=True)
-        ),
+        lines=lines,
         design=design,
         lately_px=_lately_px(series, truth, present, design),
         if_aliases=if_aliases,
         shown_px=_left(present, design, shown),
         without_lines_px=_left(present, design, dataclasses.replace(shown, lines=())),
         filled=sum(one.filled for one in series),
-        expecting_px=(
-            linear_residual(design_minimum_variance(expecting(parts, truth)), truth),
-            linear_residual(design_minimum_variance(truth), truth),
-        ),
-        period_s=truth.period_s,
+        classifying_rate_hz=_classifying_rate_hz(lines, parts, truth),
     )
+
+
+def _classifying_rate_hz(
+    lines: tuple[LineAdvice, ...], parts: tuple[float, ...], truth: Basis
+) -> float:
+    """See :class:`Advice`: designs without margins are compared, which expect the lines in part and in full."""
+    open_hz = [line.found.frequency_hz.value for line in lines if line.is_open]
+    if not open_hz:
+        return 0.0
+    in_part_px, in_full_px = (
+        linear_residual(design_minimum_variance(night), truth)
+        for night in (expecting(parts, truth), truth)
+    )
+    worth_it = in_full_px <= WORTH_CLASSIFYING * in_part_px
+    return classifying_rate(open_hz, 1 / truth.period_s) if worth_it else 0.0
 
 
 def _left(present: Design, learnt: Design, truth: Basis) -> tuple[float, float]:

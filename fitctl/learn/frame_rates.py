@@ -91,6 +91,11 @@ def by_rate(
     return usual, others
 
 
+def joined(pieces: Sequence[Rows]) -> Rows:
+    """The rows of all pieces."""
+    return np.concatenate([np.empty(0, np.intp), *pieces])
+
+
 def classifying_rate(frequencies_hz: Sequence[float], rate_hz: float) -> float:
     """The frame rate, Hz, at which these lines and their aliases are farthest from each other.
 
@@ -179,10 +184,8 @@ def _shown(
         each, hz = costs(at, likeliest_hz), line.frequency_hz.value
         best, second, *_ = sorted(each)
         true_hz = _true_hz(hz, rate_hz)[int(np.argmin(each))]
-        *_, faster = np.split(
-            np.array(_places_hz(hz, rate_hz, other_hz, _MORE_MULTIPLES)), [1 + 2 * _MULTIPLES]
-        )
-        looks_slow = true_hz == hz and np.abs(faster - hz).min() <= SAME_LINE_HZ
+        faster = _places_hz(hz, rate_hz, other_hz, _MORE_MULTIPLES)[len(each) :]
+        looks_slow = true_hz == hz and min(abs(one - hz) for one in faster) <= SAME_LINE_HZ
         if second - best >= _SURE and not looks_slow:
             shown[line] = true_hz
     return shown

@@ -20,7 +20,7 @@ from fitctl.controllers.design.theory import loop_theory
 from fitctl.controllers.pair import Design
 from fitctl.error_budget import pieces_of
 from fitctl.learn.advice import Advice, advise
-from fitctl.learn.frame_rates import SAME_LINE_HZ, AtOtherRate, Classified, by_rate
+from fitctl.learn.frame_rates import SAME_LINE_HZ, AtOtherRate, Classified, by_rate, joined
 from fitctl.learn.opened import LEAST_S, rebuild
 from fitctl.logging.records import Tick
 from fitctl.loop.learning import has_moved
@@ -159,7 +159,7 @@ class Learner:
         pieces, others = by_rate(ticks["mid_exposure_s"], pieces, self._period_s)
         theory = loop_theory(self._rig, self._loop_name, present)
         error_px = np.stack([ticks["error_az_px"], ticks["error_el_px"]], axis=-1)
-        usual = np.concatenate([np.empty(0, int), *pieces])
+        usual = joined(pieces)
         own = error_px[usual][ticks["time_s"][usual] >= self._since_s + SETTLE_S]
         az_px, el_px = (
             np.sqrt(np.mean(own**2, axis=0)).tolist()

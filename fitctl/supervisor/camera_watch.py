@@ -49,10 +49,8 @@ class CameraWatch:
         self._failed = failed
         self._last_frame_s = clock.now_s()
 
-    def begin(self, *, opened: bool) -> None:
-        """Devices were opened just now; if not the camera, it has been open all the time, or has failed."""
-        if not opened:
-            return
+    def begin(self) -> None:
+        """It was opened just now."""
         self.ready = True
         self.skipped = 0
         self.opened += 1

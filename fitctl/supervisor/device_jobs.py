@@ -162,7 +162,8 @@ class DeviceJobs:
             return
         opened: Opened = future.result()
         self.identities.update(opened.identities)
-        self._camera.begin(opened=with_camera)
+        if with_camera:  # else it has been open all the time, or has failed meanwhile
+            self._camera.begin()
         for name in names:
             loop = self._loops[name]
             loop.begin(opened.stack_v.get(name))

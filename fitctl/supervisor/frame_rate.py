@@ -24,8 +24,8 @@ PAUSE_S, MOST_PAUSE_S = 120.0, 7680.0
 class FrameRateChange:
     """Has the camera run at another rate, and at the rig file's again when the time is over.
 
-    The camera is asked beside the ticks. If its rate is not known for sure, and cannot be set to the rig file's
-    for as long as its control lasts without a sign of life, the camera has failed.
+    The executor asks the camera, so that no tick waits. If the camera does not take the rig file's rate again
+    within its heartbeat, it counts as failed.
 
     Parameters
     ----------
@@ -94,11 +94,8 @@ class FrameRateChange:
         """Change the rate for a learner, unless that was done lately; 0 is no rate."""
         now_s = self._clock.now_s()
         if self._paused_for != self._watch.opened:
-            self._paused_for, self._pause_s, self._learner_from_s = (
-                self._watch.opened,
-                PAUSE_S,
-                -math.inf,
-            )
+            self._paused_for = self._watch.opened
+            self._learner_from_s, self._pause_s = -math.inf, PAUSE_S
         if not rate_hz or now_s < self._learner_from_s or self.why_not(rate_hz, FOR_LEARNER_S):
             return
         self._learner_from_s = now_s + self._pause_s
@@ -127,15 +124,8 @@ class FrameRateChange:
 
     def _answered(self, error: Exception | None) -> None:
         now_hz, usual_hz = self._wanted_hz, self._rate_hz
-        if now_hz == usual_hz and error is None:
-            self._opened = -1
-            self._journal.event("info", CAMERA, f"runs at {usual_hz:g} Hz again")
-        elif now_hz == usual_hz and error is not None:
-            if self._clock.now_s() - self._back_from_s < self._patience_s:
-                self._job = self._executor.submit(self._camera.set_frame_rate, usual_hz)
-            else:
-                self._opened = -1
-                self._failed(error)
+        if now_hz == usual_hz:
+            self._answered_usual(error)
         elif error is None:
             self._until_s = min(self._until_s, self._clock.now_s() + self._duration_s)
             self._journal.event("info", CAMERA, f"runs at {now_hz:g} Hz for {self._duration_s:g} s")
@@ -148,6 +138,16 @@ class FrameRateChange:
                 "warning", CAMERA, f"may run at {now_hz:g} or {usual_hz:g} Hz: {why}"
             )
             self._set(usual_hz)
+
+    def _answered_usual(self, error: Exception | None) -> None:
+        if error is None:
+            self._opened = -1
+            self._journal.event("info", CAMERA, f"runs at {self._rate_hz:g} Hz again")
+        elif self._clock.now_s() - self._back_from_s < self._patience_s:
+            self._job = self._executor.submit(self._camera.set_frame_rate, self._rate_hz)
+        else:
+            self._opened = -1
+            self._failed(error)
 
     def _set(self, rate_hz: float) -> None:
         self._wanted_hz, self._back_from_s = rate_hz, self._clock.now_s()

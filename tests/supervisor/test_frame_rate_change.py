@@ -127,7 +127,7 @@ def test_a_camera_that_is_opened_again_runs_as_the_rig_file_says(held):
 
 
 def test_opening_another_loop_does_not_make_the_change_last(held_pair):
-    """Found by the swarm: the camera stayed at the other rate, for it was taken for one just opened."""
+    """The swarm found that the supervisor took the camera for one just opened, and left its rate changed."""
     assert why_not(held_pair, rate_hz=48.0, duration_s=5.0) == ""
     held_pair.run(1.0)
     assert held_pair.command(Standby(loop="left")).accepted

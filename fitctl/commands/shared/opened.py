@@ -11,7 +11,7 @@ from fitctl.controllers.pair import Design
 from fitctl.error_budget import pieces_of
 from fitctl.figures.attenuation import mirror_at_exposure_rad
 from fitctl.identify.record import axis_pair
-from fitctl.learn.frame_rates import AtOtherRate, by_rate
+from fitctl.learn.frame_rates import AtOtherRate, by_rate, joined
 from fitctl.learn.opened import Series, rebuild
 from fitctl.report.gather import Gathered
 from fitctl.report.rejection import last_design
@@ -60,7 +60,7 @@ def opened_loop(gathered: Gathered, loop_name: str) -> OpenedLoop:
     pieces, others = by_rate(exposed_s, pieces_of(exposed_s, usable), rig.camera.period_s)
     theory = loop_theory(rig, loop_name, present)
     mirror_rad = mirror_at_exposure_rad(loop.fsm, ticks)
-    error_px = axis_pair(ticks, "error_{}_px")[np.concatenate([np.empty(0, int), *pieces])]
+    error_px = axis_pair(ticks, "error_{}_px")[joined(pieces)]
     az_px, el_px = np.sqrt(np.mean(error_px**2, axis=0)).tolist() if len(error_px) else (0.0, 0.0)
     return OpenedLoop(
         rebuild(theory, ticks, pieces, mirror_rad),

@@ -154,17 +154,7 @@ class AravisCamera:
                 return None
 
     def set_frame_rate(self, rate_hz: float) -> None:
-        """Take frames at another rate from now on; also while another thread waits for one.
-
-        Raises
-        ------
-        DeviceUnreachable, DeviceTimeout
-            If the camera is closed, or no longer answers.
-        DeviceRefused
-            If the camera will not have this rate, and keeps the one it has.
-        DeviceMismatch
-            If it has taken another.
-        """
+        """As :meth:`fitctl.drivers.gige.driver.GigeCamera.set_frame_rate`; it raises the same errors."""
         self._opened()
         with self._translated("the frame rate to be readable"):
             before_hz = self._device.get_frame_rate()

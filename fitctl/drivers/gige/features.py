@@ -128,7 +128,7 @@ class Features:
         return self._set_timing(camera)
 
     def set_frame_rate(self, rate_hz: float) -> None:
-        """Set the frame rate alone, also while frames are taken.
+        """Set only the frame rate; the camera may be streaming.
 
         Raises
         ------
@@ -345,7 +345,7 @@ def expect(endpoint: Endpoint, name: str, wanted: float, actual: float, toleranc
 
 
 def refused_rate(endpoint: Endpoint, rate_hz: float, got: str) -> DeviceRefused:
-    """The error for a camera that keeps its frame rate while frames are taken."""
+    """The error for a camera that refuses another frame rate while it streams."""
     return endpoint.error(
         DeviceRefused,
         f"{rate_hz:g} frames/s from now on",
