@@ -26,7 +26,7 @@ from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.basis import Line
 from fitctl.controllers.design.linear_loop.bound import bound
 from fitctl.simulation.batch.batch import Batch
-from fitctl.simulation.batch.learning import Change
+from fitctl.simulation.batch.learning import NO_CHANGES, Changes
 from fitctl.simulation.batch.records import DONE
 
 BEGIN_S, END_S = 120.0, 300.0
@@ -186,8 +186,8 @@ class Outcome(NamedTuple):
     ways_back: int
 
 
-def residual_px(batch: Batch, seed: int, changes: Sequence[Change]) -> float:
-    """Of a run with such changes of designs."""
+def residual_px(batch: Batch, seed: int, changes: Changes) -> float:
+    """Of a run with such changes."""
     runs = [batch.run(seed, end_s, changes=changes) for end_s in (BEGIN_S, END_S)]
     if any(run.ended != DONE for run in runs):
         msg = (
@@ -205,10 +205,10 @@ def outcome(night: Night, seed: int) -> Outcome:
     batch = Batch(load_rig(default_rig_path(), settings))
     changes = batch.run(seed, END_S).changes
     return Outcome(
-        residual_px(batch, seed, ()),
+        residual_px(batch, seed, NO_CHANGES),
         residual_px(batch, seed, changes),
-        len(changes),
-        sum(not change.design.learnt for change in changes),
+        len(changes.designs),
+        sum(not change.design.learnt for change in changes.designs),
     )
 
 

@@ -38,6 +38,7 @@ from fitctl.controllers.design.linear_loop.sampled import timing
 from fitctl.controllers.design.margins import Required, design_with_margins, frequencies_hz
 from fitctl.controllers.pair import INPUTS, Design
 from fitctl.simulation.batch.batch import Batch
+from fitctl.simulation.batch.learning import NO_CHANGES
 
 Floats = NDArray[np.float64]
 TAPS = 200
@@ -144,7 +145,7 @@ def on_the_plant(design: Design, seeds: int, folder: Path) -> tuple[float, float
     save_design(design, file)
     controller = f"loops.{LOOP}.vernier.controller={file}"
     batch = Batch(load_rig(default_rig_path(), [*FIT, SIX, controller]))
-    left_px = [residual_px(batch, seed, ()) for seed in range(seeds)]
+    left_px = [residual_px(batch, seed, NO_CHANGES) for seed in range(seeds)]
     return float(np.mean(left_px)), float(np.std(left_px, ddof=1) / math.sqrt(seeds))
 
 

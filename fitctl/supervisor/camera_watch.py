@@ -31,8 +31,6 @@ class CameraWatch:
         That came with the newest frame: it is acted on, they are not.
     skipped : int
         How many those were, since the camera was opened.
-    opened : int
-        How often it was.
     """
 
     def __init__(
@@ -41,7 +39,7 @@ class CameraWatch:
         self.ready = False
         self.older: list[Frame] = []
         self.skipped = 0
-        self.opened = 0
+        self._opened = 0
         self._period_s = rig.camera.period_s
         self._silent_after_s = rig.camera.frame_delay_s + _SILENT_FRAMES * self._period_s
         self._camera = camera
@@ -53,7 +51,7 @@ class CameraWatch:
         """It was opened just now."""
         self.ready = True
         self.skipped = 0
-        self.opened += 1
+        self._opened += 1
         self._last_frame_s = self._clock.now_s()
 
     def next_frame(self, meanwhile: Callable[[], float]) -> Frame | None:
@@ -95,6 +93,11 @@ class CameraWatch:
             if frame is not None:
                 return frame
             left_s = max(0.0, until_s - self._clock.now_s())
+
+    @property
+    def opening(self) -> int | None:
+        """How often it was opened, if frames may be asked for."""
+        return self._opened if self.ready else None
 
     @property
     def well(self) -> bool:

@@ -7,10 +7,9 @@ from collections.abc import Callable
 from concurrent.futures import Executor, Future
 
 from fitctl.config import Rig
-from fitctl.drivers.interface import CameraDriver, DeviceRefused
+from fitctl.drivers.interface import DeviceRefused
 from fitctl.logging.records import CAMERA
 from fitctl.stages.journal import Journal, error_text
-from fitctl.supervisor.camera_watch import CameraWatch
 
 SLOWER = (0.9, 0.98)
 """Of the rig's frame rate: between these, exposures fit, designs still hold the star, and a line moves."""
@@ -19,6 +18,8 @@ FOR_LEARNER_S = 12.0
 """So long for the learner: designs made for the usual rate leave more of a line meanwhile;"""
 PAUSE_S, MOST_PAUSE_S = 120.0, 7680.0
 """then not again for so long, and for twice as long after each further change."""
+ASKED_LATELY_S = 20.0
+"""A learner's wish holds for so long: its next report comes after 30 s."""
 
 
 class FrameRateChange:
@@ -30,9 +31,10 @@ class FrameRateChange:
     Parameters
     ----------
     rig : Rig
-    camera : CameraDriver
-    watch : CameraWatch
-        Of the same camera.
+    set_rate : callable
+        Has the camera run at a rate in Hz: :meth:`fitctl.drivers.interface.CameraDriver.set_frame_rate`.
+    opening : callable
+        Which opening of the camera this is; None while no frames may be asked for.
     executor : Executor
         Runs one piece of device work after the other.
     journal : Journal
@@ -43,15 +45,15 @@ class FrameRateChange:
     def __init__(
         self,
         rig: Rig,
-        camera: CameraDriver,
-        watch: CameraWatch,
+        set_rate: Callable[[float], None],
+        opening: Callable[[], int | None],
         executor: Executor,
         journal: Journal,
         failed: Callable[[Exception], None],
     ) -> None:
         self._rate_hz = rig.camera.frame_rate_hz
-        self._camera = camera
-        self._watch = watch
+        self._set_rate = set_rate
+        self._opening = opening
         self._executor = executor
         self._journal = journal
         self._clock = journal.clock
@@ -62,19 +64,19 @@ class FrameRateChange:
         self._until_s = math.inf  # since the other rate is in force
         self._patience_s = rig.camera.device.heartbeat_s
         self._back_from_s = math.inf  # since when the usual rate is being set
-        self._opened = -1  # which opening of the camera this belongs to
+        self._changed: int | None = None  # at which opening of the camera
         self._learner_from_s, self._pause_s = -math.inf, PAUSE_S
-        self._paused_for = -1  # which opening of the camera the pause belongs to
+        self._paused: int | None = None  # likewise, for the learner
 
     @property
     def active(self) -> bool:
         """The camera does not run as the rig file says, or its rate is being changed."""
-        return self._opened == self._watch.opened and self._watch.ready
+        return self._changed is not None and self._changed == self._opening()
 
     def why_not(self, rate_hz: float, duration_s: float) -> str:
         """Why the rate cannot be changed so; empty if it can."""
         low_hz, high_hz = (part * self._rate_hz for part in SLOWER)
-        if not self._watch.ready:
+        if self._opening() is None:
             return "frame-rate needs an open camera; send standby first"
         if self.active:
             return f"the camera runs at {self._wanted_hz:g} Hz already; wait until it runs as usual again"
@@ -86,17 +88,19 @@ class FrameRateChange:
 
     def begin(self, rate_hz: float, duration_s: float) -> None:
         """Change the rate, which `why_not` allows."""
-        self._opened = self._watch.opened
+        self._changed = self._opening()
         self._duration_s, self._until_s = duration_s, math.inf
         self._set(rate_hz)
 
-    def for_learner(self, rate_hz: float) -> None:
-        """Change the rate for a learner, unless that was done lately; 0 is no rate."""
+    def for_learner(self, rate_hz: float, asked_s: float) -> None:
+        """Change the rate for a learner that asked for it then, unless that was done lately; 0 is no rate."""
         now_s = self._clock.now_s()
-        if self._paused_for != self._watch.opened:
-            self._paused_for = self._watch.opened
+        if self._paused != self._opening():
+            self._paused = self._opening()
             self._learner_from_s, self._pause_s = -math.inf, PAUSE_S
-        if not rate_hz or now_s < self._learner_from_s or self.why_not(rate_hz, FOR_LEARNER_S):
+        if not rate_hz or now_s - asked_s > ASKED_LATELY_S or now_s < self._learner_from_s:
+            return
+        if self.why_not(rate_hz, FOR_LEARNER_S):
             return
         self._learner_from_s = now_s + self._pause_s
         self._pause_s = min(2 * self._pause_s, MOST_PAUSE_S)
@@ -130,7 +134,7 @@ class FrameRateChange:
             self._until_s = min(self._until_s, self._clock.now_s() + self._duration_s)
             self._journal.event("info", CAMERA, f"runs at {now_hz:g} Hz for {self._duration_s:g} s")
         elif isinstance(error, DeviceRefused):
-            self._opened = -1
+            self._changed = None
             self._journal.event("warning", CAMERA, f"keeps its frame rate: {error_text(error)}")
         else:
             why = error_text(error)
@@ -141,14 +145,14 @@ class FrameRateChange:
 
     def _answered_usual(self, error: Exception | None) -> None:
         if error is None:
-            self._opened = -1
+            self._changed = None
             self._journal.event("info", CAMERA, f"runs at {self._rate_hz:g} Hz again")
         elif self._clock.now_s() - self._back_from_s < self._patience_s:
-            self._job = self._executor.submit(self._camera.set_frame_rate, self._rate_hz)
+            self._job = self._executor.submit(self._set_rate, self._rate_hz)
         else:
-            self._opened = -1
+            self._changed = None
             self._failed(error)
 
     def _set(self, rate_hz: float) -> None:
         self._wanted_hz, self._back_from_s = rate_hz, self._clock.now_s()
-        self._job = self._executor.submit(self._camera.set_frame_rate, rate_hz)
+        self._job = self._executor.submit(self._set_rate, rate_hz)

@@ -86,7 +86,6 @@ _COMMANDS: dict[type[AnyCommand], Trigger] = {
     Off: Trigger.OFF,
 }
 _POWER_UP = {Trigger.STANDBY, Trigger.RECOVER}
-_ASKED_LATELY_S = 20.0  # by a learner; its next report comes after 30 s
 MakeLoop = Callable[[str, Rig, LoopDevices, Journal, Designer], Loop]
 
 
@@ -187,7 +186,12 @@ class Supervisor:
             devices, self.loops, self.piezos, self._camera, executor, journal
         )
         self._frame_rate = FrameRateChange(
-            rig, devices.camera, self._camera, executor, journal, self._camera_failed
+            rig,
+            devices.camera.set_frame_rate,
+            lambda: self._camera.opening,
+            executor,
+            journal,
+            self._camera_failed,
         )
         self.collector = (
             CollectorWatch(rig.collector, devices.hexapod, clock, self.report_event)
@@ -584,9 +588,8 @@ class Supervisor:
         if self._design_jobs.busy or self.sequences.under_way or self._why_no_other_rate():
             return
         for name, (rate_hz, asked_s) in self._asked_rates.items():
-            learning = self.stellar_loops[name].learning
-            if now_s - asked_s <= _ASKED_LATELY_S and learning.may_act(now_s):
-                self._frame_rate.for_learner(rate_hz)
+            if self.stellar_loops[name].learning.may_act(now_s):
+                self._frame_rate.for_learner(rate_hz, asked_s)
 
     def _timed(self, record: LoopTiming) -> None:
         self.loops[record.loop].quantities.record_timing(record)

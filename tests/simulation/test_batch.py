@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from fitctl.config import StackHysteresis, default_rig_path, load_rig
-from fitctl.logging.records import ControllerChange, MetrologyTick
+from fitctl.logging.records import ControllerChange, Event, MetrologyTick
 from fitctl.messages.modes import Mode
 from fitctl.model.compiled import numba_installed
 from fitctl.model.plant_constants import plant_constants
 from fitctl.simulation.batch.batch import Batch
+from fitctl.simulation.batch.learning import Changes, RateChange
 from fitctl.simulation.batch.records import DONE, NOT_FOUND, REFUSED_COURSE
 from fitctl.simulation.batch.settings import BatchRefusalError
 from fitctl.simulation.simulation import Simulation, simulate, simulate_rig
@@ -527,11 +528,34 @@ def test_a_loop_that_learns_changes_its_design_and_goes_back_at_the_same_ticks(
     )
 
     assert [change.target for change in changes] == ["learnt", changes[0].source]
-    assert [change.design.title for change in run.changes] == [one.target for one in changes]
-    assert [change.time_s for change in run.changes] == pytest.approx(
+    assert [change.design.title for change in run.changes.designs] == [
+        one.target for one in changes
+    ]
+    assert [change.time_s for change in run.changes.designs] == pytest.approx(
         [one.time_s for one in changes], abs=1e-9
     )
     assert_same_run(simulation, run, within=1e-8)  # rounding adds up in a minute
+
+
+def test_a_loop_that_wants_another_frame_rate_has_it_at_the_same_frames(learns_at_once):
+    rig = rig_with("loops.right.learn=on", SIX_HZ, CONTROLLER.format("minimum-variance"))
+    events = []
+
+    simulation, run = both(
+        rig, 3, 60.0, lambda made: events.append(made) if isinstance(made, Event) else None
+    )
+
+    shown = [event.message for event in events if event.source == "camera"]
+    assert shown == ["runs at 47.5 Hz for 12 s", "runs at 50 Hz again"]
+    assert [rate.period_s for rate in run.changes.rates] == [1 / 47.5, 1 / 50.0]
+    assert_same_run(simulation, run, within=1e-8)
+
+
+def test_a_moving_collector_whose_camera_changes_its_rate_is_simulated():
+    rig = rig_of_testbed("collector.motion.kind=sine", "collector.motion.start_s=3.0")
+    changes = Changes((), (RateChange(100, 1 / 48),))
+
+    assert Batch(rig).run(1, 5.0, changes=changes).ended == REFUSED_COURSE
 
 
 def test_each_loop_of_the_testbed_learns_at_the_same_ticks(learns_at_once):
@@ -549,7 +573,7 @@ def test_each_loop_of_the_testbed_learns_at_the_same_ticks(learns_at_once):
 
     simulation, _, run = both_of_all(rig, 3, 42.0)
 
-    learnt = [change.loop for change in run.changes if change.design.learnt]
+    learnt = [change.loop for change in run.changes.designs if change.design.learnt]
     assert sorted(learnt) == ["left", "right"]
     for loop in learnt:
         assert_same_run(simulation, run, loop, within=1e-8)

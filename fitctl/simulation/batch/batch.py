@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -20,12 +19,13 @@ from fitctl.model.plant_constants import plant_constants
 from fitctl.model.plant_step import PlantState
 from fitctl.model.randomness import loop_seeds, place_star, run_randomness
 from fitctl.simulation.batch.course import STILL, Course, collector_course
-from fitctl.simulation.batch.learning import Change, changes_of
+from fitctl.simulation.batch.learning import NO_CHANGES, Changes, changes_of
 from fitctl.simulation.batch.records import (
     BEAM,
     BEAM_WORK,
     DESIGN,
     DONE,
+    RATE,
     REFUSED_COURSE,
     STAR,
     STAR_WORK,
@@ -79,14 +79,14 @@ class BatchRun(NamedTuple):
     loops : dict of str to LoopRun
     tilt_px : array, shape (n, 2)
         How far the stars of the fringes were apart.
-    changes : sequence of Change
-        Of designs, which loops that learn made.
+    changes : Changes
+        Which loops that learn made.
     """
 
     ended: int
     loops: dict[str, LoopRun]
     tilt_px: Floats
-    changes: Sequence[Change] = ()
+    changes: Changes = NO_CHANGES
 
 
 class Batch:
@@ -140,7 +140,7 @@ class Batch:
         duration_s: float,
         *,
         keep: bool = False,
-        changes: Sequence[Change] | None = None,
+        changes: Changes | None = None,
     ) -> BatchRun:
         """One run.
 
@@ -150,30 +150,30 @@ class Batch:
         duration_s : float
         keep : bool
             Keep every frame's states, and the true places at every step.
-        changes : sequence of Change, optional
-            Of designs; by default those that its loops make by themselves, which takes seconds to find out.
+        changes : Changes, optional
+            By default those that its loops make by themselves, which takes seconds to find out.
         """
         if changes is None and self._learns:
 
-            def ticks_with(changes: Sequence[Change]) -> dict[str, NDArray[np.void]]:
+            def ticks_with(changes: Changes) -> dict[str, NDArray[np.void]]:
                 made = self._run_with(changes, seed, duration_s, keep=True)
                 done = made.ended == DONE
                 return {name: made.loops[name].ticks for name in self._stars} if done else {}
 
             changes = changes_of(self._rig, ticks_with)
-        return self._run_with(changes or (), seed, duration_s, keep=keep)
+        return self._run_with(changes or NO_CHANGES, seed, duration_s, keep=keep)
 
-    def _run_with(
-        self, changes: Sequence[Change], seed: int, duration_s: float, *, keep: bool
-    ) -> BatchRun:
-        """One run with such changes of designs."""
+    def _run_with(self, changes: Changes, seed: int, duration_s: float, *, keep: bool) -> BatchRun:
+        """One run with such changes."""
         state, work, plant, air_random = self._beginning(seed)
         try:
             course = self._course(seed, duration_s)
         except (DeviceError, ConfigError):  # the simulation reports what is wrong
             return BatchRun(REFUSED_COURSE, {}, np.empty((0, 2)))
-        settings = self._settings.copy() if changes else self._settings
-        designs = np.array([change.settings for change in changes], DESIGN)
+        if changes.rates and course is not STILL:  # it begins at a frame, which comes later then
+            return BatchRun(REFUSED_COURSE, {}, np.empty((0, 2)))
+        settings = self._settings.copy() if changes.designs else self._settings
+        designs = np.array([change.settings for change in changes.designs], DESIGN)
         shared = settings[0]
         frames = math.ceil(duration_s / shared["period_s"]) if keep else 0
         steps = math.ceil((duration_s + 1) / shared["step_s"])
@@ -190,6 +190,7 @@ class Batch:
             self._constants,
             plant,
             designs,
+            np.array(list(changes.rates), RATE),
             tuple(air_random),
             *course,
             *self._frames_dn,

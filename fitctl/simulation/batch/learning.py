@@ -1,17 +1,19 @@
 """Batched runs whose loops learn: the live loop's learner and its decisions, on the frames of a compiled run.
 
-A run is the same until a design changes, and costs less than one of the learner's reports. So it is made again
-from its beginning with each change.
+A run is the same until a design or the camera's frame rate changes, and costs less than one of the learner's
+reports. So it is made again from its beginning with each change.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fitctl.clock import VirtualClock
 from fitctl.config import ConfigError, Rig
 from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.pair import LEAST_EXCESS_PX, Design, Measurement
@@ -23,6 +25,9 @@ from fitctl.messages.commands import LearnerReport
 from fitctl.messages.modes import Mode
 from fitctl.model.optics import scales
 from fitctl.simulation.batch.settings import design_settings
+from fitctl.simulation.devices import InlineExecutor
+from fitctl.stages.journal import Journal
+from fitctl.supervisor.frame_rate import FrameRateChange
 
 Records = NDArray[np.void]
 _NAMES = {int(mode): mode.name for mode in Mode}
@@ -48,6 +53,23 @@ class Change(NamedTuple):
     settings: Records
 
 
+class RateChange(NamedTuple):
+    """Another frame rate of the camera, after so many frames: the fields of RATE."""
+
+    frames: int
+    period_s: float
+
+
+class Changes(NamedTuple):
+    """What loops of a run change by themselves, in its order."""
+
+    designs: tuple[Change, ...]
+    rates: tuple[RateChange, ...]
+
+
+NO_CHANGES = Changes((), ())
+
+
 class _Frame(NamedTuple):
     """A tick on a frame; `beam_rad` is as :class:`fitctl.loop.observation.Observation` has it, shape (2,)."""
 
@@ -55,8 +77,8 @@ class _Frame(NamedTuple):
     beam_rad: NDArray[np.float64]
 
 
-def changes_of(rig: Rig, run: Callable[[Sequence[Change]], dict[str, Records]]) -> list[Change]:
-    """All changes of design that the loops of a run make by themselves, in their order.
+def changes_of(rig: Rig, run: Callable[[Changes], dict[str, Records]]) -> Changes:
+    """All that the loops of a run change by themselves.
 
     Parameters
     ----------
@@ -70,18 +92,53 @@ def changes_of(rig: Rig, run: Callable[[Sequence[Change]], dict[str, Records]]) 
         for index, (name, loop) in enumerate(rig.stellar_loops.items())
         if loop.learn == "on"
     ]
-    changes: list[Change] = []
+    camera = _Camera(rig)
+    changes = NO_CHANGES
     ticks = run(changes)
     number = 0
     while ticks and number < min(map(len, ticks.values())):
-        new = [change for loop in loops for change in loop.decide(ticks[loop.name], number)]
-        if new:
-            changes += new
+        designs = tuple(
+            change for loop in loops for change in loop.decide(ticks[loop.name], number)
+        )
+        rates = camera.decide(loops, ticks[loops[0].name]["now_s"][number], number + 1)
+        if designs or rates:
+            changes = Changes(changes.designs + designs, changes.rates + rates)
             ticks = run(changes)
         for loop in loops if ticks else ():
             loop.finish(ticks[loop.name], number)
         number += 1
     return changes
+
+
+class _Camera:
+    """What the supervisor does with the camera's frame rate."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._clock = VirtualClock()
+        self._rates: list[RateChange] = []
+        self._frames = 0
+        self._looked_s = 0.0
+        self._change = FrameRateChange(
+            rig,
+            lambda hz: self._rates.append(RateChange(self._frames, 1 / hz)),
+            lambda: 1,
+            InlineExecutor(),
+            Journal(self._clock, lambda _: None),
+            lambda _: None,
+        )
+
+    def decide(self, loops: list[_Loop], now_s: float, frames: int) -> tuple[RateChange, ...]:
+        """Which rate follows a frame, if it is another: for a learner, or the rig file's again."""
+        self._rates.clear()
+        self._frames = frames
+        self._clock.sleep_until(now_s)
+        self._change.check()
+        if now_s - self._looked_s >= 1.0:  # it looks once a second whether a learner wants one
+            self._looked_s = now_s
+            for loop in loops:
+                if loop.learning.may_act(now_s):
+                    self._change.for_learner(*loop.asked)
+        return tuple(self._rates)
 
 
 class _Loop:
@@ -96,7 +153,8 @@ class _Loop:
         self._linked = loop.link is not None
         self._sky_rad_s = sky_rad_s(loop.star_rate_sky_arcsec_s, scales(rig, loop))
         self._learner = Learner(rig, name)
-        self._learning = Learning(rig, name)
+        self.learning = Learning(rig, name)
+        self.asked = (0.0, -math.inf)  # for which frame rate, Hz, and when
         self._pointing = Pointing(
             rig, name, np.array([target_px.az, target_px.el]), design_for(rig, name)
         )
@@ -108,11 +166,12 @@ class _Loop:
 
     def decide(self, ticks: Records, number: int) -> list[Change]:
         """Change the design before the loop acts on a frame: to a learnt one, or back to the one before."""
-        frame, learning = self._frame(ticks, number), self._learning
+        frame, learning = self._frame(ticks, number), self.learning
         shown, made = frame.shown, []
         report, self._report = self._report, None
         if report is not None and not refused_report(report):
             learning.accept(report)
+            self.asked = (report.classifying_rate_hz, shown.time_s)
             if learning.wants_change(shown.time_s):
                 made += self._designed(number, shown.time_s, report)
         holds = shown.mode == Mode.VERNIER.name and not shown.held
@@ -151,7 +210,7 @@ class _Loop:
             pointing.forget()
         self._saturated = shown.fsm_saturated
         self._learner.add(shown)
-        self._learner.watch(self._learning.design_json or pointing.design.title, shown.time_s)
+        self._learner.watch(self.learning.design_json or pointing.design.title, shown.time_s)
         if self._learner.due:
             self._report = self._learner.report(pointing.design)
 
@@ -167,7 +226,7 @@ class _Loop:
         self, number: int, now_s: float, design: Design, report: LearnerReport | None
     ) -> Change:
         pointing = self._pointing
-        self._learning.changed(pointing.design, design, report, pointing.recent, by_itself=True)
+        self.learning.changed(pointing.design, design, report, pointing.recent, by_itself=True)
         pointing.use(design)
         knows = pointing.start_knowing()
         if not knows:

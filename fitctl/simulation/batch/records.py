@@ -221,6 +221,9 @@ DESIGN = np.dtype(
     ]
 )
 
+# The camera's frame period, after so many frames.
+RATE = np.dtype([("frames", "i8"), ("period_s", "f8")])
+
 # fitctl.model.plant_constants.Epoch; of those that are not used, `from_node` is never reached.
 EPOCH = np.dtype(
     [

@@ -285,6 +285,7 @@ def run(
     constants: Any,
     plant_state: Any,
     designs: Any,
+    rates: Any,
     air_random: Any,
     array_m: Floats,
     star_rad: Floats,
@@ -305,6 +306,8 @@ def run(
         Of all loops. The state is the result; designs that change are written into the settings.
     designs : structured array of DESIGN, shape (n,)
         That replace those before them, in the order of their frames.
+    rates : structured array of RATE, shape (n,)
+        Of the camera, likewise; before them it runs as the rig file says.
     air_random : tuple of Generator
         One for each spot of the camera, then one for each metrology beam.
     array_m, star_rad : arrays, shape (steps, 2)
@@ -328,11 +331,11 @@ def run(
     drawn = frames = 0
     begin(ss, rr, ww, cc, pp)
     due_s = first_s = math.inf
-    now_s = 0.0
+    now_s, period_s = 0.0, ss.period_s
     mode = OFF
     while mode in (OFF, STANDBY) or now_s < duration_s:
         # Devices open in the first step, a period after the beginning; then frames come.
-        exposed_s = first_s + frames * ss.period_s
+        exposed_s = first_s + frames * period_s
         came = exposed_s + ss.delay_s <= now_s + 2 * ss.period_s + 1e-9
         waited_s = ss.period_s if mode == OFF else 2 * ss.period_s
         until_s = exposed_s + ss.delay_s if came else now_s + waited_s
@@ -362,6 +365,10 @@ def run(
         if came:
             frames += 1
             expose(ss, rr, ww, exposed_s)
+            for n in range(len(rates)):
+                if rates[n].frames == frames:  # the next is exposed a new period later
+                    first_s += (frames - 1) * (period_s - rates[n].period_s)
+                    period_s = rates[n].period_s
         if not tick(ss, rr, ww, cc, pp, designs, came, exposed_s, air_random, frame_dn, search_dn):
             return NOT_FOUND
         keep_run(ss, rr, ww, before, ticks, true_px, samples, beam_m)
