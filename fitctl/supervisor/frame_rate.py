@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
+from typing import Protocol
 
 from fitctl.config import Rig
 from fitctl.drivers.interface import DeviceRefused
@@ -22,6 +23,14 @@ ASKED_LATELY_S = 20.0
 """A learner's wish holds for so long: its next report comes after 30 s."""
 
 
+class HasFrameRate(Protocol):
+    """Of a CameraDriver, what sets the frame rate."""
+
+    def set_frame_rate(self, rate_hz: float) -> None:
+        """See :meth:`fitctl.drivers.interface.CameraDriver.set_frame_rate`."""
+        ...
+
+
 class FrameRateChange:
     """Has the camera run at another rate, and at the rig file's again when the time is over.
 
@@ -31,8 +40,7 @@ class FrameRateChange:
     Parameters
     ----------
     rig : Rig
-    set_rate : callable
-        Has the camera run at a rate in Hz: :meth:`fitctl.drivers.interface.CameraDriver.set_frame_rate`.
+    camera : HasFrameRate
     opening : callable
         Which opening of the camera this is; None while no frames may be asked for.
     executor : Executor
@@ -45,14 +53,14 @@ class FrameRateChange:
     def __init__(
         self,
         rig: Rig,
-        set_rate: Callable[[float], None],
+        camera: HasFrameRate,
         opening: Callable[[], int | None],
         executor: Executor,
         journal: Journal,
         failed: Callable[[Exception], None],
     ) -> None:
         self._rate_hz = rig.camera.frame_rate_hz
-        self._set_rate = set_rate
+        self._camera = camera
         self._opening = opening
         self._executor = executor
         self._journal = journal
@@ -148,11 +156,11 @@ class FrameRateChange:
             self._changed = None
             self._journal.event("info", CAMERA, f"runs at {self._rate_hz:g} Hz again")
         elif self._clock.now_s() - self._back_from_s < self._patience_s:
-            self._job = self._executor.submit(self._set_rate, self._rate_hz)
+            self._job = self._executor.submit(self._camera.set_frame_rate, self._rate_hz)
         else:
             self._changed = None
             self._failed(error)
 
     def _set(self, rate_hz: float) -> None:
         self._wanted_hz, self._back_from_s = rate_hz, self._clock.now_s()
-        self._job = self._executor.submit(self._set_rate, rate_hz)
+        self._job = self._executor.submit(self._camera.set_frame_rate, rate_hz)

@@ -187,7 +187,7 @@ class Supervisor:
         )
         self._frame_rate = FrameRateChange(
             rig,
-            devices.camera.set_frame_rate,
+            devices.camera,
             lambda: self._camera.opening,
             executor,
             journal,

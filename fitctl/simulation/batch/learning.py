@@ -120,7 +120,7 @@ class _Camera:
         self._looked_s = 0.0
         self._change = FrameRateChange(
             rig,
-            lambda hz: self._rates.append(RateChange(self._frames, 1 / hz)),
+            self,
             lambda: 1,
             InlineExecutor(),
             Journal(self._clock, lambda _: None),
@@ -139,6 +139,10 @@ class _Camera:
                 if loop.learning.may_act(now_s):
                     self._change.for_learner(*loop.asked)
         return tuple(self._rates)
+
+    def set_frame_rate(self, rate_hz: float) -> None:
+        """From the next frame on."""
+        self._rates.append(RateChange(self._frames, 1 / rate_hz))
 
 
 class _Loop:
