@@ -41,7 +41,7 @@ from fitctl.learn.frame_rates import (
     classifying_rate,
 )
 from fitctl.learn.intervals import Interval
-from fitctl.learn.night import LearntLine, Night, estimate
+from fitctl.learn.night import LearntLine, Night, estimate, estimate_with_aliases
 from fitctl.learn.opened import LEAST_S, Series, periodograms
 
 Floats = NDArray[np.float64]
@@ -465,8 +465,12 @@ def estimated(
         )
         raise ConfigError(msg)
     night = estimate(opened, rig_basis.air_path, rig_basis.noise_px)
-    suspects = [line for line in night.lines if can_be_alias(line.for_design, rig_basis)]
-    classified = classify(night, suspects, 1 / rig_basis.period_s, known, others)
+    classified = _classified(night, rig_basis, known, others)
+    if any(one.is_alias for one in classified):
+        true_hz = dict(classified)
+        at_hz = {line: true_hz.get(hz := line.frequency_hz.value, hz) for line in night.lines}
+        night = estimate_with_aliases(opened, night, at_hz)
+        classified = _classified(night, rig_basis, classified)
     slow_hz = tuple(one.frequency_hz for one in classified if not one.is_alias)
     rig_basis = dataclasses.replace(rig_basis, slow_lines_hz=slow_hz)
     true_hz = dict(classified)
@@ -484,6 +488,17 @@ def estimated(
         overshoot=_overshoot_for_design(night),
     )
     return night, truth, classified
+
+
+def _classified(
+    night: Night,
+    rig_basis: Basis,
+    known: Sequence[Classified],
+    others: Sequence[AtOtherRate] = (),
+) -> list[Classified]:
+    """Of the lines that can be aliases, those of which it is known."""
+    suspects = [line for line in night.lines if can_be_alias(line.for_design, rig_basis)]
+    return classify(night, suspects, 1 / rig_basis.period_s, known, others)
 
 
 def _lately_px(

@@ -14,10 +14,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.controllers.design.linear_loop.spectrum import air_of
-from fitctl.learn.night import LEAST_LINE_HZ, LearntLine, Night
+from fitctl.controllers.design.linear_loop.spectrum import seen_at_hz
+from fitctl.learn.night import LEAST_LINE_HZ, LearntLine, Night, guess_of
 from fitctl.learn.opened import Opened, Series, periodograms
-from fitctl.learn.whittle import Guess, LineGuess, likeliest
+from fitctl.learn.whittle import likeliest
 from fitctl.loop.frame_rate import OTHER_RATE, frames_watched
 
 Floats = NDArray[np.float64]
@@ -196,8 +196,7 @@ def _places_hz(
 ) -> list[float]:
     """Where a line that is seen at `line_hz` may be seen at another rate: first if it is no alias."""
     true_hz = _true_hz(line_hz, rate_hz, multiples)
-    seen_hz = [abs(hz - round(hz / other_hz) * other_hz) for hz in true_hz]
-    return [max(LEAST_LINE_HZ, hz) for hz in seen_hz]
+    return [max(LEAST_LINE_HZ, seen_at_hz(hz, other_hz)) for hz in true_hz]
 
 
 def _true_hz(line_hz: float, rate_hz: float, multiples: int = _MULTIPLES) -> list[float]:
@@ -211,16 +210,7 @@ def _true_hz(line_hz: float, rate_hz: float, multiples: int = _MULTIPLES) -> lis
 
 def _cost(night: Night, seen_hz: Mapping[LearntLine, float], opened: Opened) -> float:
     """Negative logarithm of the likelihood of what another rate shows, with the lines seen at these places."""
-    begin = Guess(
-        air_of(night.air_path),
-        night.noise_px.value,
-        night.mirror_gain.value,
-        night.overshoot.value,
-        tuple(
-            LineGuess(hz, line.half_width_hz.value, np.array([rms.value for rms in line.rms_px]))
-            for line, hz in seen_hz.items()
-        ),
-    )
+    begin = guess_of(night, seen_hz)
     # A mirror that may move otherwise than it did explains away a line that is not where it should be.
     end = likeliest(opened, begin, free_mirror=False)
     stayed = tuple(

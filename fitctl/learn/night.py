@@ -10,6 +10,7 @@ criterion that charges for the search over all frequencies.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +19,7 @@ from scipy.ndimage import uniform_filter1d
 
 from fitctl.config import AirPathModel
 from fitctl.controllers.design.basis import Line
-from fitctl.controllers.design.linear_loop.spectrum import air_of
+from fitctl.controllers.design.linear_loop.spectrum import air_of, seen_at_hz
 from fitctl.learn.goodness_of_fit import FitTest, fit_test
 from fitctl.learn.intervals import Z_95, Interval, of_logarithm
 from fitctl.learn.opened import Opened
@@ -139,6 +140,28 @@ def estimate(opened: Opened, expected: AirPathModel, noise_px: float) -> Night:
     found = _without_needless_lines(opened, found)
     found = _with_more_lines(opened, found, first, free_mirror=True)
     return _night(opened, found)
+
+
+def guess_of(night: Night, at_hz: Mapping[LearntLine, float]) -> Guess:
+    """The spectrum of a night, with these of its lines, each at its place."""
+    return Guess(
+        air_of(night.air_path),
+        night.noise_px.value,
+        night.mirror_gain.value,
+        night.overshoot.value,
+        tuple(
+            LineGuess(hz, line.half_width_hz.value, np.array([rms.value for rms in line.rms_px]))
+            for line, hz in at_hz.items()
+        ),
+    )
+
+
+def estimate_with_aliases(opened: Opened, night: Night, at_hz: Mapping[LearntLine, float]) -> Night:
+    """The likeliest night near another, with its lines where they are, some above half the frame rate.
+
+    Frames show their tails otherwise than those of a slow line, for which air, mirror and noise make up.
+    """
+    return _night(opened, likeliest(opened, guess_of(night, at_hz)))
 
 
 def _with_more_lines(
@@ -274,12 +297,13 @@ def _learnt(opened: Opened, line: LineGuess, covariance: Floats) -> LearntLine:
             line.half_width_hz, 0.0, max(width.high, float(opened.resolution_hz.min()))
         )
     rate_hz = 1 / opened.period_s
+    seen_hz = seen_at_hz(line.frequency_hz, rate_hz)
     return LearntLine(
-        Interval(line.frequency_hz, line.frequency_hz - half_hz, line.frequency_hz + half_hz),
+        Interval(seen_hz, seen_hz - half_hz, seen_hz + half_hz),
         width,
         tuple(
             of_logarithm(math.log(rms), float(deviation))
             for rms, deviation in zip(line.rms_px, deviations[2:], strict=True)
         ),
-        (rate_hz - line.frequency_hz, rate_hz + line.frequency_hz),
+        (rate_hz - seen_hz, rate_hz + seen_hz),
     )

@@ -27,6 +27,7 @@ from fitctl.controllers.design.linear_loop.spectrum import (
     Air,
     air_slopes,
     framed_line_slopes,
+    seen_at_hz,
     white_px2_per_hz,
 )
 from fitctl.learn.opened import Opened
@@ -141,7 +142,6 @@ class _Problem:
         self.weight = opened.segments / opened.inflation
         self.resolution_hz = float(opened.resolution_hz.min())
         self._centres_hz = [line.frequency_hz for line in begin.lines]
-        highest_hz = 0.5 / opened.period_s
         first = [*np.log(begin.air), math.log(begin.noise_px), math.log(begin.gain)]
         first.append(begin.overshoot)
         # The air must not become a resonance, or it would pass for a line.
@@ -156,8 +156,11 @@ class _Problem:
         centre = [*first[:_GAIN], 0.0, 0.0]
         for line in begin.lines:
             width = math.log(max(line.half_width_hz, self.resolution_hz * _NARROWEST * 2))
-            widest = math.log(BROADEST * line.frequency_hz)
-            away = min(_FARTHEST, (highest_hz - line.frequency_hz) / self.resolution_hz)
+            seen_hz = seen_at_hz(line.frequency_hz, 1 / opened.period_s)
+            widest = math.log(BROADEST * seen_hz)
+            is_alias = seen_hz < line.frequency_hz
+            most_hz = math.inf if is_alias else 0.5 / opened.period_s - line.frequency_hz
+            away = min(_FARTHEST, most_hz / self.resolution_hz)
             rms = np.log(np.maximum(line.rms_px, 1e-3 * begin.noise_px)).tolist()
             first += [0.0, min(width, widest), *rms]
             centre += [0.0, math.log(self.resolution_hz), *rms]

@@ -6,14 +6,15 @@ The disturbance of each frame is rebuilt from where the stages were, and both de
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Rig
-from fitctl.controllers.design.basis import Basis, basis, on_its_mirror
-from fitctl.controllers.design.linear_loop.on_paper import SETTLE_S, OnPaper
+from fitctl.controllers.design.basis import Basis, basis, night_of, on_its_mirror
+from fitctl.controllers.design.linear_loop.on_paper import SETTLE_S, OnPaper, TrueSquares
 from fitctl.controllers.design.linear_loop.sampled import sampled_loop
 from fitctl.controllers.pair import Design
 from fitctl.model.optics import AzEl, Scales, scales
@@ -40,14 +41,15 @@ class Comparison:
     learnt, before : Design
         The one at work, and the one before it.
     loop_basis : Basis
-        The loop, with the mirror that the learnt design was made for.
+        The loop, with the mirror that the learnt design was made for, and the lines that it expects.
     noise_px : float
         One standard deviation of the noise on a frame, which both leave alike.
 
     Attributes
     ----------
-    before_error_px : tuple of float
-        What the design before would have left on the last frame.
+    error_px, before_error_px : tuple of float
+        What the learnt design leaves on the last frame, and the design before would have left. Of lines that
+        are known to be aliases, as much as they leave in truth.
     """
 
     def __init__(
@@ -60,6 +62,7 @@ class Comparison:
     ) -> None:
         self._noise_px2 = noise_px**2
         self._papers = OnPaper(before, loop_basis), OnPaper(learnt, loop_basis)
+        self._true = TrueSquares(loop_basis.lines, loop_basis.period_s)
         self._scale = scale
         self._mirror_gain, self._overshoot = loop_basis.mirror_gain, loop_basis.overshoot
         self._settle_frames = round(SETTLE_S / loop_basis.period_s)
@@ -72,6 +75,7 @@ class Comparison:
         """Frames are missing, or say nothing of the designs: begin again."""
         for paper in self._papers:
             paper.restart()
+        self.error_px: AzEl = (0.0, 0.0)
         self.before_error_px: AzEl = (0.0, 0.0)
         self._frames = 0
         self._first_px: Floats | None = None
@@ -88,13 +92,14 @@ class Comparison:
         disturbance_px = np.array(error_px) - mirror_px - motor_px
         if self._first_px is None:
             self._first_px = disturbance_px
-        before, learnt = (paper.step(disturbance_px - self._first_px) for paper in self._papers)
-        az_px, el_px = before.tolist()
-        self.before_error_px = az_px, el_px
+        disturbance_px = disturbance_px - self._first_px
+        before, learnt = (paper.step(disturbance_px) for paper in self._papers)
+        errors_px = np.array([error_px, before, learnt], dtype=float)
+        squares = self._true.step(disturbance_px, errors_px)
+        self.error_px, self.before_error_px, _ = map(tuple, np.sqrt(squares).tolist())
         self._frames += 1
         counted = self._frames - self._settle_frames
         if counted > 0:
-            squares = np.square(np.array([error_px, before, learnt], dtype=float))
             over = np.minimum(counted, self._over_frames)[:, None, None]
             self._means_px2 += (squares - self._means_px2) / over
 
@@ -136,7 +141,10 @@ def comparison(
     rig: Rig, loop_name: str, learnt: Design, before: Design, noise_px: float
 ) -> Comparison | None:
     """Of one loop; None if the design before is unstable on the mirror that the learnt one was made for."""
-    loop_basis = on_its_mirror(basis(rig, loop_name), learnt.parameters)
+    own = basis(rig, loop_name)
+    loop_basis = dataclasses.replace(
+        on_its_mirror(own, learnt.parameters), lines=night_of(learnt, own).lines
+    )
     if not sampled_loop(before, loop_basis).stable:
         return None
     scale = scales(rig, rig.stellar_loops[loop_name])

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import iirnotch
 
-from fitctl.controllers.design.basis import Basis
+from fitctl.controllers.design.basis import Basis, Line
 from fitctl.controllers.design.linear_loop.sampled import sampled_loop
+from fitctl.controllers.design.linear_loop.spectrum import seen_at_hz
 from fitctl.controllers.pair import Design
 
 Floats = NDArray[np.float64]
 SETTLE_S = 5.0
 """A design that begins from rest knows air path and lines after so long."""
+_NARROWEST_HZ, _SLOWEST_HZ = 0.6, 0.1
+_HALF_WIDTHS = 4.0
 
 
 class OnPaper:
@@ -46,15 +52,79 @@ class OnPaper:
         return np.asarray(made[-1])
 
 
+class TrueSquares:
+    """Squares of errors on frames, as they are between frames, too, where lines are known to be aliases.
+
+    On frames such a line is slow, and a design that counteracts it seems to leave little. In truth the mirror's
+    motion is added to it, at another frequency. So of what frames show near it, the star's motion and the
+    mirror's count each for itself.
+
+    Parameters
+    ----------
+    lines : sequence of Line
+        Where they are. Those up to half the frame rate are no aliases.
+    period_s : float
+        Of frames.
+    """
+
+    def __init__(self, lines: Sequence[Line], period_s: float) -> None:
+        self._notches = [
+            _Notch(line, period_s) for line in lines if line.frequency_hz > 0.5 / period_s
+        ]
+
+    def step(self, disturbance_px: Floats, errors_px: Floats) -> Floats:
+        """Of one frame, px², shape (n, 2).
+
+        Parameters
+        ----------
+        disturbance_px : array, shape (2,)
+            The star's motion.
+        errors_px : array, shape (n, 2)
+            What mirrors left of it.
+        """
+        if not self._notches:
+            return np.square(errors_px)
+        motions_px = np.vstack([disturbance_px, errors_px - disturbance_px])
+        else_px = motions_px
+        for notch in self._notches:
+            else_px = notch.step(else_px)
+        star_px2, *mirrors_px2 = np.square(motions_px - else_px)
+        return np.asarray(np.square(else_px[0] + else_px[1:]) + star_px2 + mirrors_px2)
+
+
+class _Notch:
+    """Takes away what is as slow as a line looks on frames."""
+
+    def __init__(self, line: Line, period_s: float) -> None:
+        rate_hz, half_width_hz = 1 / period_s, line.damping * line.frequency_hz
+        seen_hz = max(_SLOWEST_HZ, seen_at_hz(line.frequency_hz, rate_hz))
+        width_hz = max(_NARROWEST_HZ, _HALF_WIDTHS * half_width_hz)
+        b, a = iirnotch(seen_hz, seen_hz / width_hz, rate_hz)
+        self._b, self._a = b.tolist(), a.tolist()
+        self._first, self._second = np.zeros(()), np.zeros(())
+
+    def step(self, given: Floats) -> Floats:
+        """The next of a sequence, of any shape."""
+        b, a = self._b, self._a
+        left = b[0] * given + self._first
+        self._first = b[1] * given - a[1] * left + self._second
+        self._second = b[2] * given - a[2] * left
+        return left
+
+
 def left_on_paper(design: Design, basis: Basis, disturbance_px: Floats) -> Floats:
-    """Mean square of the error on frames after `SETTLE_S`, by axis, px²; NaN for too few frames.
+    """Mean square of the error after `SETTLE_S`, by axis, px²; NaN for too few frames.
+
+    On frames, but for lines of the basis that are aliases: see :class:`TrueSquares`.
 
     Parameters
     ----------
     disturbance_px : array, shape (frames, 2)
         Without gaps.
     """
-    paper = OnPaper(design, basis)
-    errors_px = [paper.step(row) for row in disturbance_px - disturbance_px[0]]
-    settled = errors_px[round(SETTLE_S / basis.period_s) :]
-    return np.mean(np.square(settled), axis=0) if settled else np.full(2, np.nan)
+    paper, true = OnPaper(design, basis), TrueSquares(basis.lines, basis.period_s)
+    squares_px2 = [
+        true.step(row, paper.step(row)[None])[0] for row in disturbance_px - disturbance_px[0]
+    ]
+    settled = squares_px2[round(SETTLE_S / basis.period_s) :]
+    return np.mean(settled, axis=0) if settled else np.full(2, np.nan)

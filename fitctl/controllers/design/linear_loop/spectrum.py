@@ -106,6 +106,11 @@ def _oscillator(
     return density.sum(axis=0), (broad * slope).sum(axis=0), stiffness * (away * slope).sum(axis=0)
 
 
+def seen_at_hz(frequency_hz: float, rate_hz: float) -> float:
+    """Where frames of a rate show a vibration: elsewhere if it is faster than half of it, an alias."""
+    return abs(frequency_hz - round(frequency_hz / rate_hz) * rate_hz)
+
+
 def white_px2_per_hz(noise_px: float, period_s: float) -> float:
     """One-sided density of a white sequence."""
     return 2 * period_s * noise_px**2
