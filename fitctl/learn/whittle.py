@@ -37,6 +37,7 @@ BROADEST = 0.1
 """Half width of a line, as a part of its frequency: what is broader is no line."""
 _NARROWEST = 0.02  # half width in half widths of a pure sine: too narrow for the segments to show
 _FARTHEST = 25.0  # from where a line was first seen, in half widths of a pure sine
+_ALIAS_REACH = 0.8
 _MOST_LOG_GAIN, _MOST_OVERSHOOT = 1.0, 0.5
 _MOST_STEPS, _LONGEST_STEP, _MOST_DAMPING = 100, 2.0, 1e6
 _ENOUGH = 1e-3  # of the cost, which is a logarithm of a probability
@@ -158,14 +159,16 @@ class _Problem:
             width = math.log(max(line.half_width_hz, self.resolution_hz * _NARROWEST * 2))
             seen_hz = seen_at_hz(line.frequency_hz, 1 / opened.period_s)
             widest = math.log(BROADEST * seen_hz)
-            is_alias = seen_hz < line.frequency_hz
-            most_hz = math.inf if is_alias else 0.5 / opened.period_s - line.frequency_hz
+            to_end_hz = 0.5 / opened.period_s - seen_hz
+            # An alias stays one, and is seen on the side of 0 and of half the frame rate where it was.
+            is_alias = line.frequency_hz > seen_hz
+            most_hz = _ALIAS_REACH * min(seen_hz, to_end_hz) if is_alias else to_end_hz
             away = min(_FARTHEST, most_hz / self.resolution_hz)
             rms = np.log(np.maximum(line.rms_px, 1e-3 * begin.noise_px)).tolist()
             first += [0.0, min(width, widest), *rms]
             centre += [0.0, math.log(self.resolution_hz), *rms]
             bounds += [
-                (-_FARTHEST, away),
+                (-away if is_alias else -_FARTHEST, away),
                 (math.log(_NARROWEST * self.resolution_hz), widest),
                 *[(value - 8, value + 8) for value in rms],
             ]

@@ -18,6 +18,7 @@ SETTLE_S = 5.0
 """A design that begins from rest knows air path and lines after so long."""
 _NARROWEST_HZ, _SLOWEST_HZ = 0.6, 0.1
 _HALF_WIDTHS = 4.0
+_FASTEST = 0.49  # of the frame rate: a notch is below half of it
 
 
 class OnPaper:
@@ -97,7 +98,8 @@ class _Notch:
 
     def __init__(self, line: Line, period_s: float) -> None:
         rate_hz, half_width_hz = 1 / period_s, line.damping * line.frequency_hz
-        seen_hz = max(_SLOWEST_HZ, seen_at_hz(line.frequency_hz, rate_hz))
+        seen_hz = seen_at_hz(line.frequency_hz, rate_hz)
+        seen_hz = min(max(_SLOWEST_HZ, seen_hz), _FASTEST * rate_hz)
         width_hz = max(_NARROWEST_HZ, _HALF_WIDTHS * half_width_hz)
         b, a = iirnotch(seen_hz, seen_hz / width_hz, rate_hz)
         self._b, self._a = b.tolist(), a.tolist()

@@ -12,8 +12,6 @@ from fitctl.config import AirPathModel
 from fitctl.controllers.design.basis import Basis
 
 Floats = NDArray[np.float64]
-# Of the frame rate: the air falls by the fourth power, so that others hardly count.
-_ALIASES = np.array([[-1.0], [0.0], [1.0]])
 
 
 class Air(NamedTuple):
@@ -67,7 +65,8 @@ def air_px2_per_hz(air: Air, frequency_hz: Floats, period_s: float) -> Floats:
 
 def air_slopes(air: Air, frequency_hz: Floats, period_s: float) -> tuple[Floats, Floats, Floats]:
     """As :func:`air_px2_per_hz`, and its derivatives by the logarithms of damping and stiffness."""
-    return _oscillator(2 * air.strength**2, air.damping, air.stiffness, frequency_hz, period_s)
+    # The air falls by the fourth power, so that more aliases hardly count.
+    return _oscillator(2 * air.strength**2, air.damping, air.stiffness, frequency_hz, period_s, 1)
 
 
 def framed_line_slopes(
@@ -83,8 +82,9 @@ def framed_line_slopes(
         and the second by this: at half power, with what the segments' length adds; shape as `frequency_hz`.
     """
     own, width = 2 * math.pi * own_hz, 4 * math.pi * half_width_hz
+    aliases = max(1, round(own_hz * period_s))
     total, by_damping, by_stiffness = _oscillator(
-        4 * width * own**2, width, own**2, frequency_hz, period_s
+        4 * width * own**2, width, own**2, frequency_hz, period_s, aliases
     )
     # The power of a line of 1 px grows with its width and with the square of its frequency.
     return total, 2 * (total + by_stiffness) / own_hz, (total + by_damping) / half_width_hz
@@ -96,9 +96,14 @@ def _oscillator(
     stiffness: float,
     frequency_hz: Floats,
     period_s: float,
+    aliases: int,
 ) -> tuple[Floats, Floats, Floats]:
-    """``power / |s² + damping s + stiffness|²`` on frames; derivatives by logarithms of the last two."""
-    omega2 = (2 * math.pi * (frequency_hz + _ALIASES / period_s)) ** 2
+    """``power / |s² + damping s + stiffness|²`` on frames; derivatives by logarithms of the last two.
+
+    Counted are those beside so many multiples of the frame rate.
+    """
+    multiples = np.arange(-aliases, aliases + 1.0)[:, None]
+    omega2 = (2 * math.pi * (frequency_hz + multiples / period_s)) ** 2
     away, broad = stiffness - omega2, damping**2 * omega2
     below = 1 / (away**2 + broad)
     density = power * below
