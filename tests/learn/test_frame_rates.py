@@ -7,6 +7,7 @@ import pytest
 
 from benchmarks.linear_loop import held
 from fitctl.controllers.design.basis import Line
+from fitctl.controllers.design.minimum_variance import design_minimum_variance
 from fitctl.learn.advice import advise
 from fitctl.learn.frame_rates import (
     OTHER_RATES,
@@ -57,6 +58,28 @@ def test_a_line_that_moves_is_an_alias(paper, fixed, hz):
     assert line.true_hz == pytest.approx(hz, abs=0.2)
     assert not line.can_be_alias  # it is one
     assert f"that it is an alias of {line.true_hz:.1f} Hz" in "\n".join(advice.lines_of_text())
+
+
+def test_a_night_with_a_known_alias_is_estimated_with_the_line_where_it_is(paper, fixed):
+    truth = dataclasses.replace(paper, lines=(Line(57.4, 0.005, 0.07),))
+    night = advised(paper, fixed, truth).night
+    strength = paper.air_path.gain_px / paper.air_path.b1_s2
+
+    assert night.strength.covers(strength)
+    assert night.mirror_gain.value == pytest.approx(1.0, abs=0.1)
+    assert night.overshoot.covers(0.0)
+    assert night.test.fits
+
+
+def test_a_design_that_counteracts_an_alias_gives_way_to_one_that_knows_it(paper, fixed):
+    """Although it leaves less on the last minute's frames."""
+    truth = shaken(paper, 44.0)
+    counteracts = design_minimum_variance(shaken(paper, 6.0))
+    advice = advised(paper, counteracts, truth)
+
+    assert advice.worth_it
+    assert advice.learnt.residual_px < 0.9 * advice.present.residual_px
+    assert advice.learnt.camera_px > advice.present.camera_px
 
 
 @pytest.mark.long

@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.linear_loop import held
 from fitctl.config import default_rig_path, load_rig
-from fitctl.controllers.design.basis import basis
+from fitctl.controllers.design.basis import Line, basis
 from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.design.linear_loop.on_paper import SETTLE_S
 from fitctl.controllers.design.minimum_variance import design_minimum_variance
@@ -104,3 +104,18 @@ def test_a_design_that_is_unstable_on_the_learnt_ones_mirror_is_not_compared(rig
 
     assert comparison(rig, "right", learnt, design_for(rig, "right", "eq20"), NOISE_PX) is None
     assert comparison(rig, "right", learnt, learnt, NOISE_PX) is not None
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_with_a_known_alias_designs_are_compared_by_what_they_leave_in_truth(rig, noisy, seed):
+    """48.9 Hz looks like 1.1 Hz on frames, where only the design that knows it leaves it alone."""
+    quiet = dataclasses.replace(noisy, noise_px=0.003)
+    truth = dataclasses.replace(quiet, lines=(Line(48.9, 0.002, 0.05),))
+    knows = dataclasses.replace(design_minimum_variance(truth), learnt=True)
+    before = design_minimum_variance(quiet)
+    compared = comparison(rig, "right", knows, before, 0.003)
+    knows_no_line = dataclasses.replace(knows, parameters=knows.parameters | {"lines": []})
+    on_frames = comparison(rig, "right", knows_no_line, before, 0.003)
+
+    assert followed(rig, truth, knows, compared, seed) == ""
+    assert "over 10 s" in followed(rig, truth, knows, on_frames, seed)

@@ -9,7 +9,8 @@ from benchmarks.linear_loop import course_px, held
 from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.basis import Line, basis
 from fitctl.controllers.design.eq20 import design_eq20
-from fitctl.controllers.design.linear_loop.on_paper import OnPaper, left_on_paper
+from fitctl.controllers.design.linear_loop.bound import linear_residual
+from fitctl.controllers.design.linear_loop.on_paper import OnPaper, TrueSquares, left_on_paper
 from fitctl.controllers.design.minimum_variance import design_minimum_variance
 
 SECONDS = 60.0
@@ -64,3 +65,54 @@ def test_where_the_star_is_at_first_does_not_matter(paper):
 
 def test_too_few_frames_leave_nothing_known(paper):
     assert np.isnan(left_on_paper(design_minimum_variance(paper), paper, np.zeros((100, 2)))).all()
+
+
+# ---------------------------------------------------------------- aliases
+
+
+def left_px(design, night, disturbance_px):
+    """Worst axis."""
+    return np.sqrt(left_on_paper(design, night, disturbance_px).max())
+
+
+@pytest.mark.parametrize(("alias_hz", "seen_hz"), [(44.0, 6.0), (48.9, 1.1), (94.0, 6.0)])
+def test_of_a_known_alias_counts_what_is_left_between_frames(paper, alias_hz, seen_hz):
+    """On frames, the design for a slow line leaves much less than in truth."""
+    quiet = dataclasses.replace(paper, noise_px=0.003)
+    night = dataclasses.replace(quiet, lines=(Line(alias_hz, 0.002, 0.05),))
+    slow = dataclasses.replace(quiet, lines=(Line(seen_hz, 0.005, 0.05),))
+    star_px = course_px(night, 6000, seed=3)
+    designs = [design_minimum_variance(one) for one in (night, slow)]
+    in_truth_px = [left_px(design, night, star_px) for design in designs]
+    on_frames_px = [left_px(design, quiet, star_px) for design in designs]
+    linear_px = [linear_residual(design, night) for design in designs]
+
+    assert in_truth_px == pytest.approx(linear_px, rel=0.15)
+    assert in_truth_px[0] < 0.9 * in_truth_px[1]
+    assert on_frames_px[1] < 0.7 * on_frames_px[0]
+
+
+def test_slow_lines_are_judged_on_frames(paper, night):
+    star_px = course_px(night, 3000, seed=3)
+    design = design_minimum_variance(night)
+
+    np.testing.assert_array_equal(
+        left_on_paper(design, night, star_px), left_on_paper(design, paper, star_px)
+    )
+
+
+def test_without_aliases_squares_are_squares(night):
+    true = TrueSquares(night.lines, night.period_s)
+    errors_px = np.array([[0.3, -0.1], [0.2, 0.4]])
+
+    np.testing.assert_array_equal(true.step(np.ones(2), errors_px), errors_px**2)
+
+
+@pytest.mark.parametrize("hz", [25.0, 25.1, 50.0, 100.0, 1234.0])
+def test_an_alias_may_look_as_slow_or_as_fast_as_frames_can_show(hz):
+    true = TrueSquares([Line(hz, 0.002, 0.05)], 0.02)
+    random = np.random.default_rng(1)
+    squares = [true.step(*np.split(random.standard_normal((3, 2)), [1])) for _ in range(2000)]
+
+    assert np.isfinite(squares).all()
+    assert np.max(squares) < 100.0
