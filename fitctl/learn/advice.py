@@ -139,7 +139,8 @@ class Advice(NamedTuple):
     design : Design
         The learnt one.
     lately_px : tuple of float
-        RMS on frames that present and learnt design would leave of the last minute as it was, worst axis.
+        RMS that present and learnt design would leave of the last minute as it was, worst axis: on frames, but of
+        known aliases in truth.
     if_aliases : IfAliases
         All lines that can be aliases.
     shown_px : tuple of float
@@ -238,9 +239,7 @@ class Advice(NamedTuple):
             _standing_text("learnt", self.learnt, self.bound_px),
             f"bound        {self.bound_px:.4f}",
             *self._more_writes_hint(),
-            "last minute  present {:.4f}, learnt {:.4f} px on frames, computed".format(
-                *self.lately_px
-            ),
+            "last minute  present {:.4f}, learnt {:.4f} px, computed".format(*self.lately_px),
         ]
         if not night.test.fits and not self.worth_it:
             text.append("The model does not explain this night: do not use the learnt design.")
