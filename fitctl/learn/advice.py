@@ -139,8 +139,8 @@ class Advice(NamedTuple):
     design : Design
         The learnt one.
     lately_px : tuple of float
-        RMS that present and learnt design would leave of the last minute as it was, worst axis: on frames, but of
-        known aliases in truth.
+        RMS that present and learnt design would leave of the last minute as it was, worst axis: on frames, and
+        of known aliases in truth.
     if_aliases : IfAliases
         All lines that can be aliases.
     shown_px : tuple of float

@@ -299,7 +299,7 @@ def _stands(title: str, design: Design, its_basis: Basis, rig: Rig, loop: str) -
         *_standing_lines(found),
     ]
     theory = theory_to_plain(loop_theory(rig, loop, design))
-    return _standing_numbers(found) | {"theory": theory}, lines
+    return _standing_numbers(found) | {"digest": design.digest, "theory": theory}, lines
 
 
 def _compare(rig: Rig, loop: str, files: Sequence[Path]) -> Report:

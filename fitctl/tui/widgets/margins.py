@@ -25,17 +25,19 @@ _NAME_COLUMNS = 14
 class DesignInUse(NamedTuple):
     """What a loop works with: a design's name, its file or its parameters, and the noise that it is made for.
 
-    The noise is None where it is the rig file's, or among the parameters.
+    The noise is None where it is the rig file's, or among the parameters. The digest is that of a file's design
+    as the loop loaded it.
     """
 
     loop: str
     design: str
     noise_px: float | None = None
+    digest: str = ""
 
 
 def design_in_use(loop: LoopState) -> DesignInUse:
     """The design that a loop works with."""
-    return DesignInUse(loop.name, loop.design, loop.noise_px)
+    return DesignInUse(loop.name, loop.design, loop.noise_px, loop.controller_digest)
 
 
 class DesignFigures:
@@ -68,6 +70,9 @@ class DesignFigures:
         if "stable" not in figures:
             # A supervisor elsewhere may name anything that the command knows, such as "bound".
             self.problem = f"{design.design} is not a design"
+            return
+        if figures.get("digest") != design.digest and design.digest:
+            self.problem = f"{Path(design.design).name} has changed since the loop loaded it"
             return
         self.figures, theory = figures, figures.pop("theory", None)
         self.theory = None if theory is None else theory_from_plain(theory)

@@ -327,6 +327,17 @@ def test_the_error_budget_waits_for_ticks_and_for_the_designs_figures():
     )
 
 
+def test_a_design_file_that_was_edited_after_the_loop_loaded_it_has_no_figures():
+    figures = DesignFigures()
+    for digest, problem in (
+        ("now", "steep.json has changed since the loop loaded it"),
+        ("loaded", ""),
+    ):
+        output = json.dumps({"stable": True, "digest": digest})
+        figures.accept(DesignInUse("right", "/designs/steep.json", None, "loaded"), output, 0)
+        assert figures.problem == problem
+
+
 def test_other_modes_have_neither_an_error_budget_nor_a_prediction():
     state = loop_of(np.random.default_rng(1).normal(0.0, 0.02, (2000, 2)))
     figures = known_design(state)
