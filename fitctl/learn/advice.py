@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,7 +26,9 @@ from fitctl.controllers.design.margins import (
 from fitctl.controllers.design.minimum_variance import design_minimum_variance
 from fitctl.controllers.pair import LEARNT, Design
 from fitctl.learn.aliases import (
+    SIDES,
     IfAliases,
+    alias_of,
     at_frequency,
     both_if_aliases,
     can_be_alias,
@@ -42,7 +44,7 @@ from fitctl.learn.frame_rates import (
 )
 from fitctl.learn.intervals import Interval
 from fitctl.learn.night import LearntLine, Night, estimate, estimate_with_aliases
-from fitctl.learn.opened import LEAST_S, Series, periodograms
+from fitctl.learn.opened import LEAST_S, Opened, Series, periodograms
 
 Floats = NDArray[np.float64]
 WORTH_IT = 0.98
@@ -58,8 +60,6 @@ design that should have left 4 % less left 4 % more. Between two learnt designs 
 LATELY_S = 60.0
 TOLERATED = (0.85, 1.15)
 """A design does not compensate for a mirror's gain between these: its margins cover the deviation."""
-TOLERATED_IF_ALIAS = (0.7, 1.4)
-"""The same if a line may be an alias, which spoils the estimate of the gain."""
 MORE_WRITES, MORE_WRITES_WORTH = 5, 0.95
 """The advice mentions so many writes of the D/A in a frame if they lower the bound to this part of it."""
 _AXES = ("az", "el")
@@ -466,27 +466,26 @@ def estimated(
     night = estimate(opened, rig_basis.air_path, rig_basis.noise_px)
     classified = _classified(night, rig_basis, known, others)
     if any(one.is_alias for one in classified):
-        true_hz = dict(classified)
-        at_hz = {line: true_hz.get(hz := line.frequency_hz.value, hz) for line in night.lines}
-        night = estimate_with_aliases(opened, night, at_hz)
+        night = estimate_with_aliases(opened, night, _places_hz(night, classified))
         classified = _classified(night, rig_basis, classified)
     slow_hz = tuple(one.frequency_hz for one in classified if not one.is_alias)
     rig_basis = dataclasses.replace(rig_basis, slow_lines_hz=slow_hz)
-    true_hz = dict(classified)
+    at_hz = _places_hz(night, classified)
     truth = dataclasses.replace(
         rig_basis,
         noise_px=night.noise_px.value,
         air_path=night.air_path,
-        lines=tuple(
-            at_frequency(
-                line.for_design, true_hz.get(line.frequency_hz.value, line.frequency_hz.value)
-            )
-            for line in night.lines
-        ),
-        mirror_gain=_gain_for_design(night, rig_basis),
+        lines=tuple(at_frequency(line.for_design, hz) for line, hz in at_hz.items()),
+        mirror_gain=_gain_for_design(opened, night, at_hz, rig_basis),
         overshoot=_overshoot_for_design(night),
     )
     return night, truth, classified
+
+
+def _places_hz(night: Night, classified: Sequence[Classified]) -> dict[LearntLine, float]:
+    """Where the lines of a night are, as far as it is known."""
+    true_hz = dict(classified)
+    return {line: true_hz.get(hz := line.frequency_hz.value, hz) for line in night.lines}
 
 
 def _classified(
@@ -518,11 +517,14 @@ def _lately_px(
     return present_px, learnt_px
 
 
-def _gain_for_design(night: Night, rig_basis: Basis) -> float:
+def _gain_for_design(
+    opened: Opened, night: Night, at_hz: Mapping[LearntLine, float], rig_basis: Basis
+) -> float:
     """Of the mirror: the rig file's, unless the night says otherwise beyond what the margins cover.
 
-    Within them the estimate is not worth its risk: a line above half the frame rate has other tails than the
-    slow line that it looks like, and the gain makes up for them, by 30 % on some nights.
+    Within them the estimate is not worth its risk. Where lines can be aliases, the night must say so with each
+    of them, too: an alias has other tails than the slow line that it looks like, and the gain makes up for
+    them, by 30 % on some nights.
 
     Raises
     ------
@@ -530,10 +532,15 @@ def _gain_for_design(night: Night, rig_basis: Basis) -> float:
         If the mirror moves so little or so much that something is wrong with it.
     """
     found = night.mirror_gain
-    suspect = any(can_be_alias(line.for_design, rig_basis) for line in night.lines)
-    less, more = TOLERATED_IF_ALIAS if suspect else TOLERATED
-    if found.low < more and found.high > less:
+    if _is_tolerated(found):
         return 1.0
+    suspects = [line for line in night.lines if can_be_alias(line.for_design, rig_basis)]
+    for side in SIDES if suspects else ():
+        aliases_hz = {
+            line: alias_of(line.for_design, rig_basis, side).frequency_hz for line in suspects
+        }
+        if _is_tolerated(estimate_with_aliases(opened, night, {**at_hz, **aliases_hz}).mirror_gain):
+            return 1.0
     if not LEAST_GAIN <= found.value <= 1 / LEAST_GAIN:
         msg = (
             f"learn: the mirror moves by {found} of what the rig file predicts; expected {LEAST_GAIN:g} to "
@@ -542,6 +549,11 @@ def _gain_for_design(night: Night, rig_basis: Basis) -> float:
         )
         raise ConfigError(msg)
     return found.value
+
+
+def _is_tolerated(gain: Interval) -> bool:
+    less, more = TOLERATED
+    return gain.low < more and gain.high > less
 
 
 def _shown_gain(night: Night) -> float:

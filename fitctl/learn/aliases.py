@@ -31,6 +31,8 @@ little for a risk: if lines are aliases, it may leave no more even with `LEAST_M
 LEAST_MOTION = 0.9
 PARTS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12, 0.08, 0.06, 0.0)
 """Of a line's RMS that a design may expect, the largest first."""
+SIDES = (-1, 1)
+"""Of the frame rate, on which the slowest aliases of a line are."""
 
 
 class IfAliases(NamedTuple):
@@ -63,15 +65,15 @@ def if_aliases(design: Design, truth: Basis, lines: tuple[Line, ...], mirror_gai
     nights = [
         dataclasses.replace(
             kept,
-            lines=kept.lines + tuple(_alias(line, truth, side) for line in lines),
+            lines=kept.lines + tuple(alias_of(line, truth, side) for line in lines),
             mirror_gain=mirror_gain,
         )
-        for side in (-1, 1)
+        for side in SIDES
     ]
     return np.array([linear_residual(design, night) for night in nights])
 
 
-def _alias(line: Line, truth: Basis, side: int) -> Line:
+def alias_of(line: Line, truth: Basis, side: int) -> Line:
     """The line on this side of the frame rate that looks like it; the one below it if the other is too fast."""
     rate_hz = 1 / truth.period_s
     hz = rate_hz + side * line.frequency_hz
