@@ -27,7 +27,7 @@ PAUSE_S, MOST_PAUSE_S = 60.0, 960.0
 """After a way back, no change of design by itself for so long; twice as long after each further one."""
 # The mean square of the error, over a time constant, may pass that of the design before by a factor in RMS. The
 # comparison finds later what is worse by less.
-_WATCHES = ((0.3, 2.0), (10.0, 1.25))
+_RMS_LIMITS = ((0.3, 2.0), (10.0, 1.25))
 # A louder night is louder for the design before, too. Beyond so many times, it may as well be a fault.
 _LOUDER = 2.0
 STILL_PX_PER_S = 0.05
@@ -61,9 +61,9 @@ class Learning:
         self._frame_rate = RateWatch(rig.camera.period_s)
         self._longest_gap_s = _LONGEST_GAP * rig.camera.period_s
         self._last_s = math.inf
-        self._keep = [math.exp(-rig.camera.period_s / over_s) for over_s, _ in _WATCHES]
-        self._means_px2 = [[0.0, 0.0] for _ in _WATCHES]
-        self._before_px2 = [[0.0, 0.0] for _ in _WATCHES]
+        self._keep = [math.exp(-rig.camera.period_s / over_s) for over_s, _ in _RMS_LIMITS]
+        self._means_px2 = [[0.0, 0.0] for _ in _RMS_LIMITS]
+        self._before_px2 = [[0.0, 0.0] for _ in _RMS_LIMITS]
         self._limit_px = math.inf
         self._by_hand = False
         self._calm_since_s: float | None = None
@@ -236,7 +236,7 @@ class Learning:
         worse = "" if self._comparison is None else self._comparison.why_back
         before_px = None if self._comparison is None else self._comparison.before_error_px
         for (over_s, factor), keep, means, before in zip(
-            _WATCHES, self._keep, self._means_px2, self._before_px2, strict=True
+            _RMS_LIMITS, self._keep, self._means_px2, self._before_px2, strict=True
         ):
             for axis in (0, 1):
                 means[axis] = keep * means[axis] + (1.0 - keep) * error_px[axis] ** 2
