@@ -37,7 +37,7 @@ BROADEST = 0.1
 """Half width of a line, as a part of its frequency: what is broader is no line."""
 _NARROWEST = 0.02  # half width in half widths of a pure sine: too narrow for the segments to show
 _FARTHEST = 25.0  # from where a line was first seen, in half widths of a pure sine
-_ALIAS_REACH = 0.8
+_ALIAS_REACH = 0.8  # part of the way to 0 or to half the frame rate that an alias may move
 _MOST_LOG_GAIN, _MOST_OVERSHOOT = 1.0, 0.5
 _MOST_STEPS, _LONGEST_STEP, _MOST_DAMPING = 100, 2.0, 1e6
 _ENOUGH = 1e-3  # of the cost, which is a logarithm of a probability
@@ -160,7 +160,7 @@ class _Problem:
             seen_hz = seen_at_hz(line.frequency_hz, 1 / opened.period_s)
             widest = math.log(BROADEST * seen_hz)
             to_end_hz = 0.5 / opened.period_s - seen_hz
-            # An alias stays one, and is seen on the side of 0 and of half the frame rate where it was.
+            # The search may not move an alias past a multiple of half the frame rate.
             is_alias = line.frequency_hz > seen_hz
             most_hz = _ALIAS_REACH * min(seen_hz, to_end_hz) if is_alias else to_end_hz
             away = min(_FARTHEST, most_hz / self.resolution_hz)

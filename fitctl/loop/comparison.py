@@ -47,9 +47,8 @@ class Comparison:
 
     Attributes
     ----------
-    error_px, before_error_px : tuple of float
-        What the learnt design leaves on the last frame, and the design before would have left. Of lines that
-        are known to be aliases, as much as they leave in truth.
+    before_error_px : tuple of float
+        What the design before would have left on the last frame.
     """
 
     def __init__(
@@ -62,8 +61,8 @@ class Comparison:
     ) -> None:
         self._noise_px2 = noise_px**2
         self._papers = OnPaper(before, loop_basis), OnPaper(learnt, loop_basis)
-        self._true = TrueSquares(loop_basis.lines, loop_basis.period_s)
         self._scale = scale
+        self._basis = loop_basis
         self._mirror_gain, self._overshoot = loop_basis.mirror_gain, loop_basis.overshoot
         self._settle_frames = round(SETTLE_S / loop_basis.period_s)
         self._over_frames = np.array(
@@ -75,8 +74,8 @@ class Comparison:
         """Frames are missing, or say nothing of the designs: begin again."""
         for paper in self._papers:
             paper.restart()
-        self.error_px: AzEl = (0.0, 0.0)
         self.before_error_px: AzEl = (0.0, 0.0)
+        self._true = TrueSquares(self._basis.lines, self._basis.period_s)
         self._frames = 0
         self._first_px: Floats | None = None
         self._mirror_px: Floats | None = None
@@ -94,9 +93,10 @@ class Comparison:
             self._first_px = disturbance_px
         disturbance_px = disturbance_px - self._first_px
         before, learnt = (paper.step(disturbance_px) for paper in self._papers)
+        az_px, el_px = before.tolist()
+        self.before_error_px = az_px, el_px
         errors_px = np.array([error_px, before, learnt], dtype=float)
         squares = self._true.step(disturbance_px, errors_px)
-        self.error_px, self.before_error_px, _ = map(tuple, np.sqrt(squares).tolist())
         self._frames += 1
         counted = self._frames - self._settle_frames
         if counted > 0:
@@ -105,7 +105,10 @@ class Comparison:
 
     @property
     def before_px(self) -> float:
-        """RMS on frames that the design before would have left, worst axis; NaN until it has settled."""
+        """RMS that the design before would have left, worst axis; NaN until it has settled.
+
+        On frames, and of known aliases in truth.
+        """
         settled = self._frames > 2 * self._settle_frames
         return math.sqrt(self._means_px2[0, _BEFORE].max()) if settled else math.nan
 
@@ -125,7 +128,7 @@ class Comparison:
                 left = f"would leave {math.sqrt(learnt_px2 - noise_px2):.4f} px besides the noise"
                 return _better(left, over_s, before_px2 - noise_px2)
             if measured_px2 > most_measured**2 * before_px2:
-                left = f"leaves {math.sqrt(measured_px2):.4f} px on frames"
+                left = f"leaves {math.sqrt(measured_px2):.4f} px"
                 return _better(left, over_s, before_px2)
         return ""
 

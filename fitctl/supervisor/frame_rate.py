@@ -19,7 +19,7 @@ FOR_LEARNER_S = 12.0
 """So long for the learner: designs made for the usual rate leave more of a line meanwhile;"""
 PAUSE_S, MOST_PAUSE_S = 120.0, 7680.0
 """then not again for so long, and for twice as long after each further change."""
-ASKED_LATELY_S = 20.0
+_ASKED_LATELY_S = 20.0
 """A learner's wish holds for so long: its next report comes after 30 s."""
 
 
@@ -106,7 +106,7 @@ class FrameRateChange:
         if self._paused != self._opening():
             self._paused = self._opening()
             self._learner_from_s, self._pause_s = -math.inf, PAUSE_S
-        if not rate_hz or now_s - asked_s > ASKED_LATELY_S or now_s < self._learner_from_s:
+        if not rate_hz or now_s - asked_s > _ASKED_LATELY_S or now_s < self._learner_from_s:
             return
         if self.why_not(rate_hz, FOR_LEARNER_S):
             return

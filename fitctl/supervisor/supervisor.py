@@ -587,9 +587,9 @@ class Supervisor:
         """Change the frame rate if a learner has asked for it lately, once its design is in use."""
         if self._design_jobs.busy or self.sequences.under_way or self._why_no_other_rate():
             return
-        for name, (rate_hz, asked_s) in self._asked_rates.items():
-            if self.stellar_loops[name].learning.may_act(now_s):
-                self._frame_rate.for_learner(rate_hz, asked_s)
+        for name, loop in self.stellar_loops.items():
+            if name in self._asked_rates and loop.learning.may_act(now_s):
+                self._frame_rate.for_learner(*self._asked_rates[name])
 
     def _timed(self, record: LoopTiming) -> None:
         self.loops[record.loop].quantities.record_timing(record)

@@ -18,7 +18,7 @@ SETTLE_S = 5.0
 """A design that begins from rest knows air path and lines after so long."""
 _NARROWEST_HZ, _SLOWEST_HZ = 0.6, 0.1
 _HALF_WIDTHS = 4.0
-_FASTEST = 0.49  # of the frame rate: a notch is below half of it
+_BROADEST = 0.25  # of the frame rate: what is broader would be unstable near half of it
 
 
 class OnPaper:
@@ -86,21 +86,22 @@ class TrueSquares:
         if not self._notches:
             return np.square(errors_px)
         motions_px = np.vstack([disturbance_px, errors_px - disturbance_px])
-        else_px = motions_px
+        rest_px = motions_px
         for notch in self._notches:
-            else_px = notch.step(else_px)
-        star_px2, *mirrors_px2 = np.square(motions_px - else_px)
-        return np.asarray(np.square(else_px[0] + else_px[1:]) + star_px2 + mirrors_px2)
+            rest_px = notch.step(rest_px)
+        star_px2, *mirrors_px2 = np.square(motions_px - rest_px)
+        return np.asarray(np.square(rest_px[0] + rest_px[1:]) + star_px2 + mirrors_px2)
 
 
 class _Notch:
-    """Takes away what is as slow as a line looks on frames."""
+    """Removes the frequencies near which frames show a line."""
 
     def __init__(self, line: Line, period_s: float) -> None:
         rate_hz, half_width_hz = 1 / period_s, line.damping * line.frequency_hz
         seen_hz = seen_at_hz(line.frequency_hz, rate_hz)
-        seen_hz = min(max(_SLOWEST_HZ, seen_hz), _FASTEST * rate_hz)
+        seen_hz = min(max(_SLOWEST_HZ, seen_hz), rate_hz / 2 - _SLOWEST_HZ)
         width_hz = max(_NARROWEST_HZ, _HALF_WIDTHS * half_width_hz)
+        width_hz = min(width_hz, _BROADEST * rate_hz)
         b, a = iirnotch(seen_hz, seen_hz / width_hz, rate_hz)
         self._b, self._a = b.tolist(), a.tolist()
         self._first, self._second = np.zeros(()), np.zeros(())
@@ -117,7 +118,7 @@ class _Notch:
 def left_on_paper(design: Design, basis: Basis, disturbance_px: Floats) -> Floats:
     """Mean square of the error after `SETTLE_S`, by axis, px²; NaN for too few frames.
 
-    On frames, but for lines of the basis that are aliases: see :class:`TrueSquares`.
+    On frames; of lines of the basis that are aliases, in truth: see :class:`TrueSquares`.
 
     Parameters
     ----------

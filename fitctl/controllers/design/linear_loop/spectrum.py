@@ -65,8 +65,7 @@ def air_px2_per_hz(air: Air, frequency_hz: Floats, period_s: float) -> Floats:
 
 def air_slopes(air: Air, frequency_hz: Floats, period_s: float) -> tuple[Floats, Floats, Floats]:
     """As :func:`air_px2_per_hz`, and its derivatives by the logarithms of damping and stiffness."""
-    # The air falls by the fourth power, so that more aliases hardly count.
-    return _oscillator(2 * air.strength**2, air.damping, air.stiffness, frequency_hz, period_s, 1)
+    return _oscillator(2 * air.strength**2, air.damping, air.stiffness, frequency_hz, period_s)
 
 
 def framed_line_slopes(
@@ -82,9 +81,8 @@ def framed_line_slopes(
         and the second by this: at half power, with what the segments' length adds; shape as `frequency_hz`.
     """
     own, width = 2 * math.pi * own_hz, 4 * math.pi * half_width_hz
-    aliases = max(1, round(own_hz * period_s))
     total, by_damping, by_stiffness = _oscillator(
-        4 * width * own**2, width, own**2, frequency_hz, period_s, aliases
+        4 * width * own**2, width, own**2, frequency_hz, period_s, round(own_hz * period_s)
     )
     # The power of a line of 1 px grows with its width and with the square of its frequency.
     return total, 2 * (total + by_stiffness) / own_hz, (total + by_damping) / half_width_hz
@@ -96,14 +94,17 @@ def _oscillator(
     stiffness: float,
     frequency_hz: Floats,
     period_s: float,
-    aliases: int,
+    nearest: int = 0,
 ) -> tuple[Floats, Floats, Floats]:
     """``power / |s² + damping s + stiffness|²`` on frames; derivatives by logarithms of the last two.
 
-    Counted are those beside so many multiples of the frame rate.
+    Counted are aliases beside the first multiple of the frame rate, and beside those about the nearest to it.
     """
-    multiples = np.arange(-aliases, aliases + 1.0)[:, None]
-    omega2 = (2 * math.pi * (frequency_hz + multiples / period_s)) ** 2
+    multiples = {-1, 0, 1}
+    if nearest > 1:
+        multiples |= {side * (nearest + beside) for side in (-1, 1) for beside in (-1, 0, 1)}
+    rates = np.array(sorted(multiples), dtype=float)[:, None] / period_s
+    omega2 = (2 * math.pi * (frequency_hz + rates)) ** 2
     away, broad = stiffness - omega2, damping**2 * omega2
     below = 1 / (away**2 + broad)
     density = power * below
@@ -112,7 +113,7 @@ def _oscillator(
 
 
 def seen_at_hz(frequency_hz: float, rate_hz: float) -> float:
-    """Where frames of a rate show a vibration: elsewhere if it is faster than half of it, an alias."""
+    """Where frames of a rate show a vibration: at another frequency if it is faster than half the rate."""
     return abs(frequency_hz - round(frequency_hz / rate_hz) * rate_hz)
 
 
