@@ -47,8 +47,9 @@ class Comparison:
 
     Attributes
     ----------
-    before_error_px : tuple of float
-        What the design before would have left on the last frame.
+    error_px, before_error_px : tuple of float
+        What the learnt design leaves on the last frame, and the design before would have left, without what is
+        near known aliases.
     """
 
     def __init__(
@@ -61,8 +62,9 @@ class Comparison:
     ) -> None:
         self._noise_px2 = noise_px**2
         self._papers = OnPaper(before, loop_basis), OnPaper(learnt, loop_basis)
+        # It goes on where both begin again: errors on frames have no jump there.
+        self._true = TrueSquares(loop_basis.lines, loop_basis.period_s)
         self._scale = scale
-        self._basis = loop_basis
         self._mirror_gain, self._overshoot = loop_basis.mirror_gain, loop_basis.overshoot
         self._settle_frames = round(SETTLE_S / loop_basis.period_s)
         self._over_frames = np.array(
@@ -74,8 +76,8 @@ class Comparison:
         """Frames are missing, or say nothing of the designs: begin again."""
         for paper in self._papers:
             paper.restart()
+        self.error_px: AzEl = (0.0, 0.0)
         self.before_error_px: AzEl = (0.0, 0.0)
-        self._true = TrueSquares(self._basis.lines, self._basis.period_s)
         self._frames = 0
         self._first_px: Floats | None = None
         self._mirror_px: Floats | None = None
@@ -93,10 +95,9 @@ class Comparison:
             self._first_px = disturbance_px
         disturbance_px = disturbance_px - self._first_px
         before, learnt = (paper.step(disturbance_px) for paper in self._papers)
-        az_px, el_px = before.tolist()
-        self.before_error_px = az_px, el_px
         errors_px = np.array([error_px, before, learnt], dtype=float)
-        squares = self._true.step(disturbance_px, errors_px)
+        squares, rest_px = self._true.step(disturbance_px, errors_px)
+        self.error_px, self.before_error_px, _ = map(tuple, rest_px.tolist())
         self._frames += 1
         counted = self._frames - self._settle_frames
         if counted > 0:

@@ -225,6 +225,7 @@ class Learning:
             return ""
         if self._comparison is not None and not saturated:
             self._comparison.observe(error_px, *stages_rad)
+            error_px = self._comparison.error_px
         return self._why_back(error_px)
 
     def _restart_comparison(self) -> None:

@@ -73,8 +73,8 @@ class TrueSquares:
             _Notch(line, period_s) for line in lines if line.frequency_hz > 0.5 / period_s
         ]
 
-    def step(self, disturbance_px: Floats, errors_px: Floats) -> Floats:
-        """Of one frame, px², shape (n, 2).
+    def step(self, disturbance_px: Floats, errors_px: Floats) -> tuple[Floats, Floats]:
+        """Of one frame, px², and the errors without what is near aliases, px, shape (n, 2) each.
 
         Parameters
         ----------
@@ -84,13 +84,14 @@ class TrueSquares:
             What mirrors left of it.
         """
         if not self._notches:
-            return np.square(errors_px)
+            return np.square(errors_px), errors_px
         motions_px = np.vstack([disturbance_px, errors_px - disturbance_px])
         rest_px = motions_px
         for notch in self._notches:
             rest_px = notch.step(rest_px)
         star_px2, *mirrors_px2 = np.square(motions_px - rest_px)
-        return np.asarray(np.square(rest_px[0] + rest_px[1:]) + star_px2 + mirrors_px2)
+        without_px = rest_px[0] + rest_px[1:]
+        return np.square(without_px) + star_px2 + mirrors_px2, without_px
 
 
 class _Notch:
@@ -127,7 +128,7 @@ def left_on_paper(design: Design, basis: Basis, disturbance_px: Floats) -> Float
     """
     paper, true = OnPaper(design, basis), TrueSquares(basis.lines, basis.period_s)
     squares_px2 = [
-        true.step(row, paper.step(row)[None])[0] for row in disturbance_px - disturbance_px[0]
+        true.step(row, paper.step(row)[None])[0][0] for row in disturbance_px - disturbance_px[0]
     ]
     settled = squares_px2[round(SETTLE_S / basis.period_s) :]
     return np.mean(settled, axis=0) if settled else np.full(2, np.nan)
