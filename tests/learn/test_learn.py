@@ -84,9 +84,10 @@ def test_a_long_piece_is_cut_into_segments(paper):
 # ---------------------------------------------------------------- the likelihood
 
 
-def test_the_likelihoods_slope_is_its_own(shaken, shaken_opened):
+@pytest.mark.parametrize("line_hz", [3.2, 46.8, 103.2])
+def test_the_likelihoods_slope_is_its_own(shaken, shaken_opened, line_hz):
     rms = np.array([0.03, 0.05])
-    begin = Guess(Air(1.2, 4.0, 3.0), 0.012, 0.9, 0.03, (LineGuess(3.2, 0.02, rms),))
+    begin = Guess(Air(1.2, 4.0, 3.0), 0.012, 0.9, 0.03, (LineGuess(line_hz, 0.02, rms),))
     problem = _Problem(shaken_opened, begin)
     at = problem.begin + 0.05
     slope = _Place(problem, at).gradient
@@ -95,10 +96,11 @@ def test_the_likelihoods_slope_is_its_own(shaken, shaken_opened):
         assert slope[index] == pytest.approx(by_difference, rel=1e-3, abs=1e-2)
 
 
-def test_a_fast_line_has_its_place_among_slow_frequencies(paper):
+@pytest.mark.parametrize("hz", [48.9, 51.1, 98.9, 101.1, 1001.1])
+def test_a_fast_line_has_its_place_among_slow_frequencies(paper, hz):
     at_hz = np.linspace(0.5, 24.5, 4801)
     width_hz = np.full(len(at_hz), 0.05)
-    density = framed_line_slopes(48.9, width_hz, at_hz, paper.period_s)[0]
+    density = framed_line_slopes(hz, width_hz, at_hz, paper.period_s)[0]
 
     assert at_hz[density.argmax()] == pytest.approx(1.1, abs=0.01)
     assert np.trapezoid(density, at_hz) == pytest.approx(1.0, rel=0.1)

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from benchmarks.learn_online import NIGHTS, outcome
 from fitctl.config import StackHysteresis, default_rig_path, load_rig
 from fitctl.logging.records import ControllerChange, Event, MetrologyTick
 from fitctl.messages.modes import Mode
@@ -549,6 +550,15 @@ def test_a_loop_that_wants_another_frame_rate_has_it_at_the_same_frames(learns_a
     assert shown == ["runs at 47.5 Hz for 12 s", "runs at 50 Hz again"]
     assert [rate.period_s for rate in run.changes.rates] == [1 / 47.5, 1 / 50.0]
     assert_same_run(simulation, run, within=1e-8)
+
+
+def test_a_line_that_is_known_to_be_an_alias_is_left_alone():
+    """On frames, 48.9 Hz looks like 1.1 Hz, which the fixed design removes."""
+    night = next(one for one in NIGHTS if one.name == "48.9 Hz, 0.05 px")
+    made = outcome(night, 0)
+
+    assert made.learnt_px < 0.9 * made.fixed_px
+    assert made.ways_back == 0
 
 
 def test_a_moving_collector_whose_camera_changes_its_rate_is_simulated():

@@ -110,11 +110,23 @@ def test_without_aliases_squares_are_squares(night):
     np.testing.assert_array_equal(rest_px, errors_px)
 
 
-@pytest.mark.parametrize("hz", [25.0, 25.1, 50.0, 100.0, 1234.0])
-def test_an_alias_may_look_as_slow_or_as_fast_as_frames_can_show(hz):
-    true = TrueSquares([Line(hz, 0.002, 0.05)], 0.02)
+@pytest.mark.parametrize("hz", [25.0, 25.1, 50.0, 60.0, 100.0, 1234.0])
+@pytest.mark.parametrize("damping", [1e-4, 0.1, 0.99])
+@pytest.mark.parametrize("rate_hz", [1.0, 50.0, 500.0])
+def test_lines_of_any_place_and_width_have_finite_squares(hz, damping, rate_hz):
+    true = TrueSquares([Line(hz * rate_hz / 50.0, damping, 0.05)], 1 / rate_hz)
     random = np.random.default_rng(1)
     squares = [true.step(*np.split(random.standard_normal((3, 2)), [1]))[0] for _ in range(2000)]
 
     assert np.isfinite(squares).all()
     assert np.max(squares) < 100.0
+
+
+@pytest.mark.parametrize(("rate_hz", "hz"), [(50.0, 74.9), (50.0, 44.0), (500.0, 253.0)])
+def test_an_alias_that_a_mirror_follows_on_frames_counts_twice(rate_hz, hz):
+    true = TrueSquares([Line(hz, 0.0005, 1.0)], 1 / rate_hz)
+    star_px = np.sin(2 * np.pi * hz * np.arange(round(40 * rate_hz)) / rate_hz + 1.0)
+    star_px = np.stack([star_px, star_px], axis=-1)
+    squares = [true.step(one, np.zeros((1, 2)))[0] for one in star_px][len(star_px) // 2 :]
+
+    assert np.mean(squares) == pytest.approx(2 * np.mean(star_px**2), rel=0.1)
