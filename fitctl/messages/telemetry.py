@@ -130,10 +130,11 @@ class LearningState(msgspec.Struct, frozen=True, kw_only=True):
     design_json : str
         Of the learnt design in force; empty without.
     expected_px, measured_px : float
-        RMS of the error on frames with the learnt design in force; NaN without.
+        RMS of the error on frames with the learnt design in force; NaN without. The measured one leaves out
+        what is near known aliases.
     before_px : float
-        RMS on the same frames that the design before would have left, by computation; NaN where it is not
-        known.
+        RMS on the same frames that the design before would have left, by computation, and of known aliases in
+        truth; NaN where it is not known.
     """
 
     setting: Literal["off", "advise", "on"]
