@@ -33,6 +33,7 @@ from fitctl.learn.aliases import (
     both_if_aliases,
     can_be_alias,
     expecting,
+    nights_if_aliases,
     safe_parts,
 )
 from fitctl.learn.frame_rates import (
@@ -281,16 +282,16 @@ class Advice(NamedTuple):
         return text
 
     def _alias_hint(self) -> list[str]:
-        """Tells an operator who knows the rig's vibrations how to have such lines counteracted in full."""
-        if not any(line.is_open for line in self.lines):
-            return []
-        text = [
-            "             if you know how fast vibrations are at most, set fastest_line_hz: lines that are "
-            "then no aliases are counteracted in full"
-        ]
+        """Tells an operator how to find out which lines are aliases, or to say that none is."""
+        text = []
+        if any(line.is_open for line in self.lines):
+            text.append(
+                "             if you know how fast vibrations are at most, set fastest_line_hz: lines that are "
+                "then no aliases are counteracted in full"
+            )
         if self.classifying_rate_hz:
             text.append(
-                "             another frame rate shows which they are, while the star is held: "
+                "             another frame rate shows which lines are aliases, while the star is held: "
                 f"fitctl send frame-rate {self.classifying_rate_hz:g}"
             )
         return text
@@ -423,16 +424,21 @@ def advise(
 def _classifying_rate_hz(
     lines: tuple[LineAdvice, ...], parts: tuple[float, ...], truth: Basis
 ) -> float:
-    """See :class:`Advice`: designs without margins are compared, which expect the lines in part and in full."""
-    open_hz = [line.found.frequency_hz.value for line in lines if line.is_open]
-    if not open_hz:
+    """See :class:`Advice`; 0 unless a design that knows which lines are aliases would leave clearly less.
+
+    Designs without margins are compared, each on the night that it knows, with one that expects lines in part.
+    """
+    suspects = tuple(line for line in truth.lines if can_be_alias(line, truth))
+    if not suspects:
         return 0.0
-    in_part_px, in_full_px = (
-        linear_residual(design_minimum_variance(night), truth)
-        for night in (expecting(parts, truth), truth)
+    in_part = design_minimum_variance(expecting(parts, truth))
+    worth_it = any(
+        linear_residual(design_minimum_variance(night), night)
+        <= WORTH_CLASSIFYING * linear_residual(in_part, night)
+        for night in (truth, *nights_if_aliases(truth, suspects))
     )
-    worth_it = in_full_px <= WORTH_CLASSIFYING * in_part_px
-    return classifying_rate(open_hz, 1 / truth.period_s) if worth_it else 0.0
+    suspects_hz = [line.found.frequency_hz.value for line in lines if line.can_be_alias]
+    return classifying_rate(suspects_hz, 1 / truth.period_s) if worth_it else 0.0
 
 
 def _left(present: Design, learnt: Design, truth: Basis) -> tuple[float, float]:

@@ -61,16 +61,19 @@ def if_aliases(design: Design, truth: Basis, lines: tuple[Line, ...], mirror_gai
     The mirror's response is added to such a line. Its steps between frames also have a part at the line's own
     frequency, which makes the line larger or smaller, and differently on both sides.
     """
+    nights = nights_if_aliases(dataclasses.replace(truth, mirror_gain=mirror_gain), lines)
+    return np.array([linear_residual(design, night) for night in nights])
+
+
+def nights_if_aliases(truth: Basis, lines: tuple[Line, ...]) -> list[Basis]:
+    """The night, with these of its lines just below the frame rate, and just above it."""
     kept = _without(lines, truth)
-    nights = [
+    return [
         dataclasses.replace(
-            kept,
-            lines=kept.lines + tuple(alias_of(line, truth, side) for line in lines),
-            mirror_gain=mirror_gain,
+            kept, lines=kept.lines + tuple(alias_of(line, truth, side) for line in lines)
         )
         for side in SIDES
     ]
-    return np.array([linear_residual(design, night) for night in nights])
 
 
 def alias_of(line: Line, truth: Basis, side: int) -> Line:

@@ -31,7 +31,7 @@ _MULTIPLES, _MORE_MULTIPLES = 2, 5
 SAME_LINE_HZ = 0.3
 """A line is the one that was classified before if it is no farther from it: some drift."""
 WORTH_CLASSIFYING = 0.95
-"""A design that expects all lines in full must leave at most this part, or another rate is not worth it."""
+"""A design that knows which lines are aliases must leave at most this part, or another rate is not worth it."""
 _ROUNDS = 3
 _STAYS_HZ = 0.2
 """So far a line may be from where it is expected."""
