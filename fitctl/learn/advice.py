@@ -470,10 +470,10 @@ def estimated(
         )
         raise ConfigError(msg)
     night = estimate(opened, rig_basis.air_path, rig_basis.noise_px)
-    classified = _classified(night, rig_basis, known, others)
+    classified = _classified(opened, night, rig_basis, known, others)
     if any(one.is_alias for one in classified):
         night = estimate_with_aliases(opened, night, _places_hz(night, classified))
-        classified = _classified(night, rig_basis, classified)
+        classified = _classified(opened, night, rig_basis, classified)
     slow_hz = tuple(one.frequency_hz for one in classified if not one.is_alias)
     rig_basis = dataclasses.replace(rig_basis, slow_lines_hz=slow_hz)
     at_hz = _places_hz(night, classified)
@@ -495,6 +495,7 @@ def _places_hz(night: Night, classified: Sequence[Classified]) -> dict[LearntLin
 
 
 def _classified(
+    opened: Opened,
     night: Night,
     rig_basis: Basis,
     known: Sequence[Classified],
@@ -502,7 +503,7 @@ def _classified(
 ) -> list[Classified]:
     """Of the lines that can be aliases, those of which it is known."""
     suspects = [line for line in night.lines if can_be_alias(line.for_design, rig_basis)]
-    return classify(night, suspects, 1 / rig_basis.period_s, known, others)
+    return classify(opened, night, suspects, 1 / rig_basis.period_s, known, others)
 
 
 def _lately_px(

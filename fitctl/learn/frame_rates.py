@@ -34,7 +34,9 @@ WORTH_CLASSIFYING = 0.95
 """A design that knows which lines are aliases must leave at most this part, or another rate is not worth it."""
 _ROUNDS = 3
 _STAYS_HZ = 0.2
-"""So far a line may be from where it is expected."""
+"""So far a line may be from where it is expected, and so wide,"""
+_BROADER = 3.0
+"""or so many times as wide as the night has it: beyond that it explains something else."""
 _SURE = 6.0
 """By how much the logarithm of the likelihood must be higher in one case: it is 400 times as likely."""
 
@@ -111,6 +113,7 @@ def classifying_rate(frequencies_hz: Sequence[float], rate_hz: float) -> float:
 
 
 def classify(
+    opened: Opened,
     night: Night,
     lines: Sequence[LearntLine],
     rate_hz: float,
@@ -121,8 +124,10 @@ def classify(
 
     Parameters
     ----------
-    night : Night
+    opened : Opened
         At the rig's frame rate,
+    night : Night
+        what was estimated from it,
     lines : sequence of LearntLine
         with those of its lines that may be aliases.
     rate_hz : float
@@ -139,56 +144,73 @@ def classify(
         if near:  # it may have drifted since
             true = min(near, key=lambda one: abs(one.frequency_hz - hz)).true_hz
             true_hz[line] = min(_true_hz(hz, rate_hz), key=lambda may: abs(may - true))
-    for other in others if len(true_hz) < len(lines) else ():
-        opened = periodograms(other.series, other.period_s, _LEAST_S)
-        if opened is not None:
-            true_hz |= _shown(night, lines, opened, rate_hz)
+    if len(true_hz) < len(lines):
+        made = (periodograms(other.series, other.period_s, _LEAST_S) for other in others)
+        enough = [one for one in made if one is not None]
+        if enough:
+            true_hz |= _shown(opened, night, lines, enough, rate_hz)
     return [Classified(line.frequency_hz.value, true_hz[line]) for line in lines if line in true_hz]
 
 
 def _shown(
-    night: Night, lines: Sequence[LearntLine], opened: Opened, rate_hz: float
+    opened: Opened,
+    night: Night,
+    lines: Sequence[LearntLine],
+    others: Sequence[Opened],
+    rate_hz: float,
 ) -> dict[LearntLine, float]:
-    """The lines of which another frame rate shows surely whether they are aliases; where they are, Hz."""
-    other_hz = 1 / opened.period_s
-    places_hz = {line: _places_hz(line.frequency_hz.value, rate_hz, other_hz) for line in lines}
+    """The lines of which all frames show surely whether they are aliases; where they are, Hz."""
+    places_hz = {line: _true_hz(line.frequency_hz.value, rate_hz) for line in lines}
     unsuspected_hz = {
-        line: _places_hz(line.frequency_hz.value, rate_hz, other_hz)[0]
-        for line in night.lines
-        if line not in places_hz
+        line: line.frequency_hz.value for line in night.lines if line not in places_hz
     }
 
+    def at_hz(places: Sequence[float]) -> dict[LearntLine, float]:
+        return dict(zip(places_hz, places, strict=True)) | unsuspected_hz
+
     @functools.cache
-    def cost(*seen_hz: float) -> float:
-        seen = dict(zip(places_hz, seen_hz, strict=True))
-        return _cost(night, seen | unsuspected_hz, opened)
+    def cost(*places: float) -> float:
+        return sum(_cost(night, at_hz(places), other) for other in others)
 
-    def costs(at: int, seen_hz: Sequence[float]) -> list[float]:
-        """With one line at each of its places, and the others where they are."""
-        return [cost(*seen_hz[:at], hz, *seen_hz[at + 1 :]) for hz in places_hz[lines[at]]]
+    def with_one(at: int, places: Sequence[float]) -> list[tuple[float, ...]]:
+        """One line at each of its places, and the others where they are."""
+        return [(*places[:at], hz, *places[at + 1 :]) for hz in places_hz[lines[at]]]
 
-    def improved(seen_hz: list[float]) -> list[float]:
+    def improved(places: list[float]) -> list[float]:
         """One line after the other where it is likeliest: where it is counts for what others explain."""
         for _ in range(_ROUNDS):
-            before = list(seen_hz)
+            before = list(places)
             for at, line in enumerate(lines):
-                seen_hz[at] = places_hz[line][int(np.argmin(costs(at, seen_hz)))]
-            if seen_hz == before:
+                each = [cost(*one) for one in with_one(at, places)]
+                places[at] = places_hz[line][int(np.argmin(each))]
+            if places == before:
                 break
-        return seen_hz
+        return places
 
     begins = zip(*places_hz.values(), strict=True)  # none is an alias, or all of one kind
-    likeliest_hz = min((improved(list(begin)) for begin in begins), key=lambda end: cost(*end))
+    best_hz = min((improved(list(begin)) for begin in begins), key=lambda end: cost(*end))
     shown = {}
     for at, line in enumerate(lines):
-        each, hz = costs(at, likeliest_hz), line.frequency_hz.value
+        # Frames at the usual rate show the tails of an alias otherwise than those of a slow line.
+        each = [
+            cost(*one) + likeliest(opened, guess_of(night, at_hz(one))).cost
+            for one in with_one(at, best_hz)
+        ]
         best, second, *_ = sorted(each)
-        true_hz = _true_hz(hz, rate_hz)[int(np.argmin(each))]
-        faster = _places_hz(hz, rate_hz, other_hz, _MORE_MULTIPLES)[len(each) :]
-        looks_slow = true_hz == hz and min(abs(one - hz) for one in faster) <= SAME_LINE_HZ
+        true_hz = places_hz[line][int(np.argmin(each))]
+        looks_slow = true_hz == line.frequency_hz.value and _looks_slow(true_hz, rate_hz, others)
         if second - best >= _SURE and not looks_slow:
             shown[line] = true_hz
     return shown
+
+
+def _looks_slow(line_hz: float, rate_hz: float, others: Sequence[Opened]) -> bool:
+    """Whether a line faster than those that are looked for would look like this slow one at all other rates."""
+    faster = _true_hz(line_hz, rate_hz, _MORE_MULTIPLES)[len(_true_hz(line_hz, rate_hz)) :]
+    return any(
+        all(abs(seen_at_hz(hz, 1 / other.period_s) - line_hz) <= SAME_LINE_HZ for other in others)
+        for hz in faster
+    )
 
 
 def _places_hz(
@@ -208,8 +230,10 @@ def _true_hz(line_hz: float, rate_hz: float, multiples: int = _MULTIPLES) -> lis
     ]
 
 
-def _cost(night: Night, seen_hz: Mapping[LearntLine, float], opened: Opened) -> float:
-    """Negative logarithm of the likelihood of what another rate shows, with the lines seen at these places."""
+def _cost(night: Night, at_hz: Mapping[LearntLine, float], opened: Opened) -> float:
+    """Negative logarithm of the likelihood of what another rate shows, with the lines at these places."""
+    rate_hz = 1 / opened.period_s
+    seen_hz = {line: max(LEAST_LINE_HZ, seen_at_hz(hz, rate_hz)) for line, hz in at_hz.items()}
     begin = guess_of(night, seen_hz)
     # A mirror that may move otherwise than it did explains away a line that is not where it should be.
     end = likeliest(opened, begin, free_mirror=False)
@@ -217,6 +241,7 @@ def _cost(night: Night, seen_hz: Mapping[LearntLine, float], opened: Opened) -> 
         line
         for line, found in zip(begin.lines, end.guess.lines, strict=True)
         if abs(found.frequency_hz - line.frequency_hz) <= _STAYS_HZ
+        and found.half_width_hz <= max(_BROADER * line.half_width_hz, _STAYS_HZ)
     )
     if len(stayed) < len(begin.lines):  # a line that is not there has gone to explain another
         end = likeliest(opened, begin._replace(lines=stayed), free_mirror=False)
