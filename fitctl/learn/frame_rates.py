@@ -143,13 +143,25 @@ def classify(
         near = [one for one in known if abs(one.frequency_hz - hz) <= SAME_LINE_HZ]
         if near:  # it may have drifted since
             true = min(near, key=lambda one: abs(one.frequency_hz - hz)).true_hz
-            true_hz[line] = min(_true_hz(hz, rate_hz), key=lambda may: abs(may - true))
+            at_hz = min(_true_hz(hz, rate_hz), key=lambda may: abs(may - true))
+            if at_hz == hz or not _looks_otherwise(opened, night, line, at_hz):
+                true_hz[line] = at_hz
     if len(true_hz) < len(lines):
         made = (periodograms(other.series, other.period_s, _LEAST_S) for other in others)
         enough = [one for one in made if one is not None]
         if enough:
             true_hz |= _shown(opened, night, lines, enough, rate_hz)
     return [Classified(line.frequency_hz.value, true_hz[line]) for line in lines if line in true_hz]
+
+
+def _looks_otherwise(opened: Opened, night: Night, line: LearntLine, at_hz: float) -> bool:
+    """Whether frames at the usual rate show surely that a line is not this alias, but slow."""
+    slow_hz = {one: one.frequency_hz.value for one in night.lines}
+    as_slow, as_alias = (
+        likeliest(opened, guess_of(night, places)).cost
+        for places in (slow_hz, slow_hz | {line: at_hz})
+    )
+    return as_alias - as_slow >= _SURE
 
 
 def _shown(
