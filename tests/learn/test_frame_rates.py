@@ -8,7 +8,7 @@ import pytest
 from benchmarks.linear_loop import held
 from fitctl.controllers.design.basis import Line
 from fitctl.controllers.design.minimum_variance import design_minimum_variance
-from fitctl.learn.advice import advise
+from fitctl.learn.advice import advise, estimated
 from fitctl.learn.frame_rates import (
     OTHER_RATES,
     AtOtherRate,
@@ -124,6 +124,23 @@ def test_what_was_told_before_counts_for_the_same_line(paper, fixed, told, expec
     assert [round(one.true_hz) for one in advice.classified] == [expected_hz] * (
         expected_hz is not None
     )
+
+
+def test_an_alias_that_frames_at_the_usual_rate_disprove_is_forgotten(paper, fixed):
+    _, series = held(shaken(paper, 6.0), fixed, 2 * TWO_MINUTES_S, 5)
+
+    assert estimated([series], paper, [Classified(6.0, 44.0)])[2] == []
+
+
+@pytest.mark.parametrize("hz", [1.3, 9.0])
+def test_a_line_that_is_not_there_at_the_other_rate_is_not_classified(paper, fixed, hz):
+    """A narrow line fades by itself."""
+    truth = dataclasses.replace(paper, lines=(Line(hz, 0.0005, 0.02),))
+    _, series = held(truth, fixed, TWO_MINUTES_S, 5)
+    slower = dataclasses.replace(paper, period_s=1 / classifying_rate([hz], RATE_HZ))
+    _, without = held(slower, fixed, OTHER_S, 6)
+
+    assert estimated([series], paper, (), [AtOtherRate(slower.period_s, [without])])[2] == []
 
 
 # ---------------------------------------------------------------- asking
