@@ -49,7 +49,7 @@ def test_a_line_that_stays_where_it_was_is_no_alias_and_is_counteracted_in_full(
     assert advice.classifying_rate_hz == 0.0
 
 
-@pytest.mark.parametrize("hz", [44.0, 56.0, 94.0])
+@pytest.mark.parametrize("hz", [44.0, pytest.param(56.0, marks=pytest.mark.long), 94.0])
 def test_a_line_that_moves_is_an_alias(paper, fixed, hz):
     advice = advised(paper, fixed, shaken(paper, hz))
     (line,) = advice.lines
@@ -126,13 +126,14 @@ def test_what_was_told_before_counts_for_the_same_line(paper, fixed, told, expec
     )
 
 
+@pytest.mark.long
 def test_an_alias_that_frames_at_the_usual_rate_disprove_is_forgotten(paper, fixed):
     _, series = held(shaken(paper, 6.0), fixed, 2 * TWO_MINUTES_S, 5)
 
     assert estimated([series], paper, [Classified(6.0, 44.0)])[2] == []
 
 
-@pytest.mark.parametrize("hz", [1.3, 9.0])
+@pytest.mark.parametrize("hz", [1.3, pytest.param(9.0, marks=pytest.mark.long)])
 def test_a_line_that_is_not_there_at_the_other_rate_is_not_classified(paper, fixed, hz):
     """A narrow line fades by itself."""
     truth = dataclasses.replace(paper, lines=(Line(hz, 0.0005, 0.02),))
