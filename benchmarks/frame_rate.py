@@ -73,8 +73,7 @@ def classified(number: int, seed: int) -> Counter[str]:
     )
     shown = AtOtherRate(slower.period_s, [other])
     answers = {
-        one.frequency_hz: one.is_alias
-        for one in classify(opened, night, night.lines, 1 / paper.period_s, [], [shown])
+        one.frequency_hz: one.is_alias for one in classify(opened, night, night.lines, [], [shown])
     }
     counted: Counter[str] = Counter()
     for hz in found_hz:

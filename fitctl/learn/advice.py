@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import ConfigError
-from fitctl.controllers.design.basis import LEAST_GAIN, MOST_OVERSHOOT, Basis
+from fitctl.controllers.design.basis import Basis, Line
 from fitctl.controllers.design.linear_loop.bound import bound, linear_residual
 from fitctl.controllers.design.linear_loop.loopshape import sampled_response
 from fitctl.controllers.design.linear_loop.on_paper import SETTLE_S, left_on_paper
@@ -26,26 +25,23 @@ from fitctl.controllers.design.margins import (
 from fitctl.controllers.design.minimum_variance import design_minimum_variance
 from fitctl.controllers.pair import LEARNT, Design
 from fitctl.learn.aliases import (
-    SIDES,
     IfAliases,
-    alias_of,
-    at_frequency,
     both_if_aliases,
     can_be_alias,
     expecting,
     nights_if_aliases,
     safe_parts,
 )
+from fitctl.learn.design_basis import estimated, gain_for_aliases, shown_gain
 from fitctl.learn.frame_rates import (
     WORTH_CLASSIFYING,
     AtOtherRate,
     Classified,
-    classify,
     classifying_rate,
 )
 from fitctl.learn.intervals import Interval
-from fitctl.learn.night import LearntLine, Night, estimate, estimate_with_aliases
-from fitctl.learn.opened import LEAST_S, Opened, Series, periodograms
+from fitctl.learn.night import LearntLine, Night
+from fitctl.learn.opened import LEAST_S, Series
 
 Floats = NDArray[np.float64]
 WORTH_IT = 0.98
@@ -59,8 +55,6 @@ AS_SHOWN = 0.9
 the design counts with: a hysteresis so unlike the rig file's is no gain alone. With 24 % instead of 15 %, a
 design that should have left 4 % less left 4 % more. Between two learnt designs this risk is the same."""
 LATELY_S = 60.0
-TOLERATED = (0.85, 1.15)
-"""A design does not compensate for a mirror's gain between these: its margins cover the deviation."""
 MORE_WRITES, MORE_WRITES_WORTH = 5, 0.95
 """The advice mentions so many writes of the D/A in a frame if they lower the bound to this part of it."""
 _AXES = ("az", "el")
@@ -188,7 +182,7 @@ class Advice(NamedTuple):
     def _better_as_shown(self) -> bool:
         present_px, learnt_px = self.shown_px
         counted = self.design.parameters.get("mirror_gain", 1.0)
-        moves_less = _shown_gain(self.night) < AS_SHOWN * counted
+        moves_less = shown_gain(self.night) < AS_SHOWN * counted
         part = AS_SHOWN if moves_less and self.present.name != LEARNT else WORTH_IT
         return learnt_px <= self._allowed(part) * present_px
 
@@ -383,24 +377,14 @@ def advise(
     true_hz = dict(classified)
     suspects = tuple(line for line in truth.lines if can_be_alias(line, truth))
     present_stands = standing(present, truth)
-    gain = _gain_for_aliases(night)
-    shown = dataclasses.replace(truth, mirror_gain=min(truth.mirror_gain, _shown_gain(night)))
+    gain = gain_for_aliases(night)
+    shown = dataclasses.replace(truth, mirror_gain=min(truth.mirror_gain, shown_gain(night)))
     for parts in safe_parts(truth, present, gain):
         design = design_with_margins(expecting(parts, truth), required, like)
         learnt_stands = standing(design, truth)
         if_aliases = both_if_aliases(present, design, truth, suspects, gain)
         if if_aliases.harmless or learnt_stands.residual_px > WORTH_IT * present_stands.residual_px:
             break
-    lines = tuple(
-        LineAdvice(
-            found,
-            part,
-            line in suspects,
-            true_hz.get(found.frequency_hz.value),
-            both_if_aliases(present, design, truth, (line,) if line in suspects else (), gain),
-        )
-        for found, line, part in zip(night.lines, truth.lines, parts, strict=True)
-    )
     return Advice(
         night=night,
         measured_px=measured_px,
@@ -410,25 +394,33 @@ def advise(
         more_writes_px=bound(
             dataclasses.replace(truth, writes=max(MORE_WRITES, truth.writes))
         ).residual_px,
-        lines=lines,
+        lines=tuple(
+            LineAdvice(
+                found,
+                part,
+                line in suspects,
+                true_hz.get(found.frequency_hz.value),
+                both_if_aliases(present, design, truth, (line,) if line in suspects else (), gain),
+            )
+            for found, line, part in zip(night.lines, truth.lines, parts, strict=True)
+        ),
         design=design,
         lately_px=_lately_px(series, truth, present, design),
         if_aliases=if_aliases,
         shown_px=_left(present, design, shown),
         without_lines_px=_left(present, design, dataclasses.replace(shown, lines=())),
         filled=sum(one.filled for one in series),
-        classifying_rate_hz=_classifying_rate_hz(lines, parts, truth),
+        classifying_rate_hz=_classifying_rate_hz(suspects, parts, truth),
     )
 
 
 def _classifying_rate_hz(
-    lines: tuple[LineAdvice, ...], parts: tuple[float, ...], truth: Basis
+    suspects: tuple[Line, ...], parts: tuple[float, ...], truth: Basis
 ) -> float:
     """See :class:`Advice`; 0 unless a design that knows which lines are aliases would leave clearly less.
 
     Designs without margins are compared, each on the night that it knows, with one that expects lines in part.
     """
-    suspects = tuple(line for line in truth.lines if can_be_alias(line, truth))
     if not suspects:
         return 0.0
     in_part = design_minimum_variance(expecting(parts, truth))
@@ -437,73 +429,13 @@ def _classifying_rate_hz(
         <= WORTH_CLASSIFYING * linear_residual(in_part, night)
         for night in (truth, *nights_if_aliases(truth, suspects))
     )
-    suspects_hz = [line.found.frequency_hz.value for line in lines if line.can_be_alias]
+    suspects_hz = [line.frequency_hz for line in suspects]
     return classifying_rate(suspects_hz, 1 / truth.period_s) if worth_it else 0.0
 
 
 def _left(present: Design, learnt: Design, truth: Basis) -> tuple[float, float]:
     """The residual of both designs."""
     return linear_residual(present, truth), linear_residual(learnt, truth)
-
-
-def estimated(
-    series: list[Series],
-    rig_basis: Basis,
-    known: Sequence[Classified] = (),
-    others: Sequence[AtOtherRate] = (),
-) -> tuple[Night, Basis, list[Classified]]:
-    """Estimate a night, what designs count with if that is what it was like, and which lines are aliases.
-
-    Arguments as of :func:`advise`.
-
-    Raises
-    ------
-    ConfigError
-        If there is too little of it, or the mirror hardly moves.
-    """
-    opened = periodograms(series, rig_basis.period_s)
-    if opened is None:
-        longest_s = max((len(one.disturbance_px) for one in series), default=0) * rig_basis.period_s
-        msg = (
-            f"learn: the longest piece in VERNIER is {longest_s:.0f} s; expected at least {LEAST_S:.0f} s, "
-            "preferably two minutes, with a star held on its target; give a longer log"
-        )
-        raise ConfigError(msg)
-    night = estimate(opened, rig_basis.air_path, rig_basis.noise_px)
-    classified = _classified(opened, night, rig_basis, known, others)
-    if any(one.is_alias for one in classified):
-        night = estimate_with_aliases(opened, night, _places_hz(night, classified))
-        classified = _classified(opened, night, rig_basis, classified)
-    slow_hz = tuple(one.frequency_hz for one in classified if not one.is_alias)
-    rig_basis = dataclasses.replace(rig_basis, slow_lines_hz=slow_hz)
-    at_hz = _places_hz(night, classified)
-    truth = dataclasses.replace(
-        rig_basis,
-        noise_px=night.noise_px.value,
-        air_path=night.air_path,
-        lines=tuple(at_frequency(line.for_design, hz) for line, hz in at_hz.items()),
-        mirror_gain=_gain_for_design(opened, night, at_hz, rig_basis),
-        overshoot=_overshoot_for_design(night),
-    )
-    return night, truth, classified
-
-
-def _places_hz(night: Night, classified: Sequence[Classified]) -> dict[LearntLine, float]:
-    """Where the lines of a night are, as far as it is known."""
-    true_hz = dict(classified)
-    return {line: true_hz.get(hz := line.frequency_hz.value, hz) for line in night.lines}
-
-
-def _classified(
-    opened: Opened,
-    night: Night,
-    rig_basis: Basis,
-    known: Sequence[Classified],
-    others: Sequence[AtOtherRate] = (),
-) -> list[Classified]:
-    """Of the lines that can be aliases, those of which it is known."""
-    suspects = [line for line in night.lines if can_be_alias(line.for_design, rig_basis)]
-    return classify(opened, night, suspects, 1 / rig_basis.period_s, known, others)
 
 
 def _lately_px(
@@ -522,69 +454,6 @@ def _lately_px(
         for design in (present, learnt)
     )
     return present_px, learnt_px
-
-
-def _gain_for_design(
-    opened: Opened, night: Night, at_hz: Mapping[LearntLine, float], rig_basis: Basis
-) -> float:
-    """Of the mirror: the rig file's, unless the night says otherwise beyond what the margins cover.
-
-    Within them the estimate is not worth its risk. Where lines can be aliases, the night must say so with each
-    of them, too: an alias has other tails than the slow line that it looks like, and the gain makes up for
-    them, by 30 % on some nights.
-
-    Raises
-    ------
-    ConfigError
-        If the mirror moves so little or so much that something is wrong with it.
-    """
-    found = night.mirror_gain
-    if _is_tolerated(found):
-        return 1.0
-    suspects = [line for line in night.lines if can_be_alias(line.for_design, rig_basis)]
-    for side in SIDES if suspects else ():
-        aliases_hz = {
-            line: alias_of(line.for_design, rig_basis, side).frequency_hz for line in suspects
-        }
-        if _is_tolerated(estimate_with_aliases(opened, night, {**at_hz, **aliases_hz}).mirror_gain):
-            return 1.0
-    if not LEAST_GAIN <= found.value <= 1 / LEAST_GAIN:
-        msg = (
-            f"learn: the mirror moves by {found} of what the rig file predicts; expected {LEAST_GAIN:g} to "
-            f"{1 / LEAST_GAIN:g}; look at its amplifiers and measure it with fitctl identify hysteresis; if "
-            "vernier.air_path is far from the night's air, measure that with fitctl identify airpath"
-        )
-        raise ConfigError(msg)
-    return found.value
-
-
-def _is_tolerated(gain: Interval) -> bool:
-    less, more = TOLERATED
-    return gain.low < more and gain.high > less
-
-
-def _shown_gain(night: Night) -> float:
-    """Of the mirror, where less motion speaks against a design: the estimate, if it is known to be below 1."""
-    found = night.mirror_gain
-    return found.value if found.high < 1 else 1.0
-
-
-def _gain_for_aliases(night: Night) -> float:
-    """Of the mirror, where too much of it hides harm: the estimate, even if its interval includes 1.
-
-    It counts at its least if that is less than the margins cover: after a minute of a night with 30 % of
-    hysteresis it was 0.94, at least 0.71, and later 0.6. A learnt design then left 14 % more of an alias.
-    """
-    found = night.mirror_gain
-    return min(1.0, found.value if found.low >= TOLERATED[0] else found.low)
-
-
-def _overshoot_for_design(night: Night) -> float:
-    """Of the mirror, where it is known to differ from 0; a large one means that the delay is wrong."""
-    found = night.overshoot
-    if found.covers(0.0) or abs(found.value) > MOST_OVERSHOOT:
-        return 0.0
-    return found.value
 
 
 def standing(design: Design, truth: Basis) -> Standing:

@@ -112,11 +112,25 @@ def classifying_rate(frequencies_hz: Sequence[float], rate_hz: float) -> float:
     return rate_hz * max(OTHER_RATES, key=nearest_hz)
 
 
+def classified_before(
+    lines: Sequence[LearntLine], period_s: float, known: Sequence[Classified]
+) -> list[Classified]:
+    """The lines that were classified before, where they are now: they may have drifted since."""
+    same = []
+    for line in lines:
+        hz = line.frequency_hz.value
+        near = [one for one in known if abs(one.frequency_hz - hz) <= SAME_LINE_HZ]
+        if near:
+            was_hz = min(near, key=lambda one: abs(one.frequency_hz - hz)).true_hz
+            is_hz = min(_true_hz(hz, 1 / period_s), key=lambda may: abs(may - was_hz))
+            same.append(Classified(hz, is_hz))
+    return same
+
+
 def classify(
     opened: Opened,
     night: Night,
     lines: Sequence[LearntLine],
-    rate_hz: float,
     known: Sequence[Classified],
     others: Iterable[AtOtherRate],
 ) -> list[Classified]:
@@ -130,28 +144,23 @@ def classify(
         what was estimated from it,
     lines : sequence of LearntLine
         with those of its lines that may be aliases.
-    rate_hz : float
-        The rig's.
     known : sequence of Classified
         Before.
     others : iterable of AtOtherRate
         What these show counts more than what was known before. Looked at while some line is not known.
     """
-    true_hz: dict[LearntLine, float] = {}
+    true_hz = dict(classified_before(lines, opened.period_s, known))
     for line in lines:
         hz = line.frequency_hz.value
-        near = [one for one in known if abs(one.frequency_hz - hz) <= SAME_LINE_HZ]
-        if near:  # it may have drifted since
-            true = min(near, key=lambda one: abs(one.frequency_hz - hz)).true_hz
-            at_hz = min(_true_hz(hz, rate_hz), key=lambda may: abs(may - true))
-            if at_hz == hz or not _looks_otherwise(opened, night, line, at_hz):
-                true_hz[line] = at_hz
+        if hz != true_hz.get(hz, hz) and _looks_otherwise(opened, night, line, true_hz[hz]):
+            del true_hz[hz]
     if len(true_hz) < len(lines):
         made = (periodograms(other.series, other.period_s, _LEAST_S) for other in others)
         enough = [one for one in made if one is not None]
         if enough:
-            true_hz |= _shown(opened, night, lines, enough, rate_hz)
-    return [Classified(line.frequency_hz.value, true_hz[line]) for line in lines if line in true_hz]
+            true_hz |= _shown(opened, night, lines, enough)
+    found_hz = [line.frequency_hz.value for line in lines]
+    return [Classified(hz, true_hz[hz]) for hz in found_hz if hz in true_hz]
 
 
 def _looks_otherwise(opened: Opened, night: Night, line: LearntLine, at_hz: float) -> bool:
@@ -169,9 +178,9 @@ def _shown(
     night: Night,
     lines: Sequence[LearntLine],
     others: Sequence[Opened],
-    rate_hz: float,
-) -> dict[LearntLine, float]:
-    """The lines of which all frames show surely whether they are aliases; where they are, Hz."""
+) -> dict[float, float]:
+    """The lines of which all frames show surely whether they are aliases: where they look to be and are, Hz."""
+    rate_hz = 1 / opened.period_s
     places_hz = {line: _true_hz(line.frequency_hz.value, rate_hz) for line in lines}
     unsuspected_hz = {
         line: line.frequency_hz.value for line in night.lines if line not in places_hz
@@ -212,7 +221,7 @@ def _shown(
         true_hz = places_hz[line][int(np.argmin(each))]
         looks_slow = true_hz == line.frequency_hz.value and _looks_slow(true_hz, rate_hz, others)
         if second - best >= _SURE and not looks_slow:
-            shown[line] = true_hz
+            shown[line.frequency_hz.value] = true_hz
     return shown
 
 

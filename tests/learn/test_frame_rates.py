@@ -8,7 +8,8 @@ import pytest
 from benchmarks.linear_loop import held
 from fitctl.controllers.design.basis import Line
 from fitctl.controllers.design.minimum_variance import design_minimum_variance
-from fitctl.learn.advice import advise, estimated
+from fitctl.learn.advice import advise
+from fitctl.learn.design_basis import estimated
 from fitctl.learn.frame_rates import (
     OTHER_RATES,
     AtOtherRate,

@@ -13,8 +13,9 @@ from fitctl.controllers.design.basis import Line
 from fitctl.controllers.design.linear_loop.bound import bound, linear_residual
 from fitctl.controllers.design.linear_loop.spectrum import Air, air_of, framed_line_slopes
 from fitctl.controllers.design.margins import Required, design_with_margins, margins
-from fitctl.learn.advice import advise, estimated
+from fitctl.learn.advice import advise
 from fitctl.learn.aliases import IfAliases
+from fitctl.learn.design_basis import estimated
 from fitctl.learn.goodness_of_fit import FitTest, fit_test
 from fitctl.learn.intervals import Interval
 from fitctl.learn.night import _without_needless_lines, estimate
@@ -439,7 +440,7 @@ def test_less_of_an_alias_is_counteracted_while_the_mirror_may_move_much_less(
             found = estimate(*arguments)
             return found._replace(mirror_gain=Interval(0.96, low, 2 * 0.96 - low))
 
-        monkeypatch.setattr("fitctl.learn.advice.estimate", estimated_roughly)
+        monkeypatch.setattr("fitctl.learn.design_basis.estimate", estimated_roughly)
         return advise([series], (0.1, 0.1), paper, fixed).lines[0].part
 
     assert part(0.7) < part(0.9)

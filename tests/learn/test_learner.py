@@ -14,7 +14,7 @@ from fitctl.controllers.design.basis import basis
 from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.design.files import save_design
 from fitctl.controllers.design.theory import loop_theory
-from fitctl.learn.advice import estimated
+from fitctl.learn.design_basis import estimated
 from fitctl.learn.learner import EVERY_S, FIRST_S, SETTLE_S, WINDOW_S, Learner
 from fitctl.learn.opened import rebuild
 from fitctl.learn.process import LoopLearner

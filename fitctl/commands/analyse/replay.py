@@ -20,7 +20,8 @@ from fitctl.config import ConfigError, Rig, load_rig, rig_from_log
 from fitctl.controllers.design.basis import basis
 from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.design.document import design_json
-from fitctl.learn.advice import estimated, standing
+from fitctl.learn.advice import standing
+from fitctl.learn.design_basis import estimated
 from fitctl.logging.reading import LogInfo
 from fitctl.replay.files import logged_files, missing_dark_file
 from fitctl.replay.log import read_steps, whole_run

@@ -153,15 +153,15 @@ class Batch:
         changes : Changes, optional
             By default those that its loops make by themselves, which takes seconds to find out.
         """
-        if changes is None and self._learns:
 
-            def ticks_with(changes: Changes) -> dict[str, NDArray[np.void]]:
-                made = self._run_with(changes, seed, duration_s, keep=True)
-                done = made.ended == DONE
-                return {name: made.loops[name].ticks for name in self._stars} if done else {}
+        def ticks_with(changes: Changes) -> dict[str, NDArray[np.void]]:
+            made = self._run_with(changes, seed, duration_s, keep=True)
+            done = made.ended == DONE
+            return {name: made.loops[name].ticks for name in self._stars} if done else {}
 
-            changes = changes_of(self._rig, ticks_with)
-        return self._run_with(changes or NO_CHANGES, seed, duration_s, keep=keep)
+        if changes is None:
+            changes = changes_of(self._rig, ticks_with) if self._learns else NO_CHANGES
+        return self._run_with(changes, seed, duration_s, keep=keep)
 
     def _run_with(self, changes: Changes, seed: int, duration_s: float, *, keep: bool) -> BatchRun:
         """One run with such changes."""

@@ -71,7 +71,7 @@ class DesignFigures:
             # A supervisor elsewhere may name anything that the command knows, such as "bound".
             self.problem = f"{design.design} is not a design"
             return
-        if figures.get("digest") != design.digest and design.digest:
+        if design.digest not in {"", figures.get("digest")}:
             self.problem = f"{Path(design.design).name} has changed since the loop loaded it"
             return
         self.figures, theory = figures, figures.pop("theory", None)
