@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.signal import iirnotch, lfilter
 
 from benchmarks.linear_loop import course_px, held
 from fitctl.config import default_rig_path, load_rig
@@ -130,3 +131,12 @@ def test_an_alias_that_a_mirror_follows_on_frames_counts_twice(rate_hz, hz):
     squares = [true.step(one, np.zeros((1, 2)))[0] for one in star_px][len(star_px) // 2 :]
 
     assert np.mean(squares) == pytest.approx(2 * np.mean(star_px**2), rel=0.1)
+
+
+def test_errors_without_an_alias_have_passed_scipys_notch_where_frames_show_it():
+    true = TrueSquares([Line(44.0, 0.01, 0.05)], 0.02)
+    errors_px = np.random.default_rng(2).standard_normal((300, 2))
+    rest_px = [true.step(np.zeros(2), row[None])[1][0] for row in errors_px]
+
+    scipys_px = lfilter(*iirnotch(6.0, 6.0 / 1.76, fs=50.0), errors_px, axis=0)
+    np.testing.assert_allclose(rest_px, scipys_px, atol=1e-9)
