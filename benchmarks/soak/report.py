@@ -30,7 +30,7 @@ def figures(soak: Soak, audit: Audit, seed: int, lasted_s: float, ended: str) ->
         "ended": ended,
         "strikes": [strike._asdict() for strike in course.struck],
         "not_back": [s._asdict() for s in course.struck if s.back_s > BACK_WITHIN_S],
-        "left_vernier_unstruck": course.departures,
+        "left_vernier_without_fault": course.departures,
         "growth": {
             role: {name: growth._asdict() for name, growth in rows.items()}
             for role, rows in soak.samples.growth().items()
@@ -74,7 +74,7 @@ def markdown(found: dict[str, Any]) -> str:
         f"{s['name']}: {s['back_s']:.0f} s; {'; '.join(s['told'][-_TOLD:])}"
         for s in found["not_back"]
     ]
-    wrong += [f"unstruck: {why}" for why in found["left_vernier_unstruck"]]
+    wrong += [f"without a fault: {why}" for why in found["left_vernier_without_fault"]]
     wrong += found["logs"]["problems"]
     tables = (
         _table(("the whole", ""), _whole(found)),
@@ -83,7 +83,7 @@ def markdown(found: dict[str, Any]) -> str:
             _growth_rows(found["growth"]),
         ),
         _table(
-            ("timing", "unstruck", "from a strike until back"),
+            ("timing", "without a fault", "from a fault until back"),
             (
                 (_name(key), _number(value), _number(found["struck"][key]))
                 for key, value in found["quiet"].items()
@@ -108,7 +108,7 @@ def _whole(found: dict[str, Any]) -> Iterable[tuple[str, str]]:
             f"{median(back_s):.1f} (median), {max(back_s):.1f} (worst)",
         )
     yield f"not back within {BACK_WITHIN_S:g} s", str(len(found["not_back"]))
-    yield "left VERNIER unstruck", str(len(found["left_vernier_unstruck"]))
+    yield "left VERNIER without a fault", str(len(found["left_vernier_without_fault"]))
     if found["load"]:
         load = found["load"]
         yield "load of the machine", f"{load['median']:.1f} (median), {load['most']:.1f} (most)"

@@ -355,7 +355,8 @@ class CollectorScan(Step):
 class BeamScan(Step):
     """Move the beam over the photodiodes; its log is for `fitctl identify photodiodes` and `link_delay`.
 
-    The beam is let go, and goes to and fro along one axis after the other, fast and slowly. It ends in STANDBY.
+    The loop stops holding the beam and moves it to and fro along each axis, fast and then slowly. It ends in
+    STANDBY.
     """
 
     step: Literal["beam_scan"] = "beam_scan"

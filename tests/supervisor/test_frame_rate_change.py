@@ -263,6 +263,18 @@ def test_a_wish_of_long_ago_is_forgotten(held):
     assert period_s(held) == pytest.approx(USUAL_S)
 
 
+def test_of_two_loops_that_ask_the_rigs_first_gets_its_rate(held_pair, monkeypatch):
+    supervisor, now_s = held_pair.supervisor, held_pair.ticks[-1].time_s
+    for loop in supervisor.stellar_loops.values():
+        monkeypatch.setattr(loop.learning, "may_act", lambda _now_s: True)
+    for name, rate_hz in (("left", 47.0), ("right", 48.0)):
+        supervisor._asked_rates[name] = rate_hz, now_s
+    held_pair.run(3.0)
+
+    assert list(supervisor.stellar_loops) == ["right", "left"]
+    assert told(held_pair) == ["runs at 48 Hz for 12 s"]
+
+
 def test_a_sequence_that_begins_ends_the_change(held):
     assert why_not(held, rate_hz=48.0, duration_s=60.0) == ""
     held.run(1.0)

@@ -39,12 +39,7 @@ LogArgument = Annotated[
 LogsArgument = Annotated[
     list[Path] | None, typer.Argument(metavar="LOG...", help="MCAP files, finished or not.")
 ]
-OutOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--out", metavar="FILE", help="Log to write. [default: LOG_cut.mcap, LOG_recovered.mcap]"
-    ),
-]
+
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Overwrite an existing file.")]
 TopicOption = Annotated[
     list[str] | None,
@@ -258,7 +253,10 @@ def verify(
 @app.command()
 def recover(
     log: LogArgument = None,
-    out: OutOption = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Log to write. [default: LOG_recovered.mcap]"),
+    ] = None,
     overwrite: OverwriteOption = False,
     latest: LatestOption = False,
     rig: RigOption = None,
@@ -300,7 +298,10 @@ def cut(
         typer.Option("--to", metavar="TIME", help="End of the span, exclusive, in the same form."),
     ] = None,
     topic: TopicOption = None,
-    out: OutOption = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Log to write. [default: LOG_cut.mcap]"),
+    ] = None,
     overwrite: OverwriteOption = False,
     latest: LatestOption = False,
     rig: RigOption = None,

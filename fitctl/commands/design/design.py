@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from fitctl.commands.design.learn import learn
 from fitctl.commands.shared.logs import LatestOption, chosen_logs
-from fitctl.commands.shared.options import JsonOption, LoopOption, RigOption, SetOption
+from fitctl.commands.shared.options import DesignedRigOption, JsonOption, LoopOption, SetOption
 from fitctl.commands.shared.printing import say_lines, to_json
 from fitctl.commands.shared.rig import require_loop, rig_of
 from fitctl.config import ConfigError, Rig
@@ -55,7 +55,7 @@ def design(
             help="learn: logs of one run, or a folder, which means its newest run. compare: further designs.",
         ),
     ] = None,
-    rig: RigOption = None,
+    rig: DesignedRigOption = None,
     overrides: SetOption = None,
     loop: LoopOption = "right",
     latest: LatestOption = False,

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from fitctl.commands.shared.exits import FAILED
-from fitctl.commands.shared.options import LoopOption, RigOption, SeedOption, SetOption
+from fitctl.commands.shared.options import LoopOption, SeedOption, SetOption, ShippedRigOption
 from fitctl.commands.shared.plant import require_plant
 from fitctl.commands.shared.printing import progress_line, say
 from fitctl.commands.shared.rig import require_loop, rig_of
@@ -19,7 +19,7 @@ from fitctl.identify.errors import IdentifyError
 
 def figures(
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder to write; created if missing.")],
-    rig: RigOption = None,
+    rig: ShippedRigOption = None,
     overrides: SetOption = None,
     loop: LoopOption = "right",
     seed: SeedOption = 0,

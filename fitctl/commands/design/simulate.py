@@ -13,9 +13,9 @@ from fitctl.commands.shared.exits import FAILED
 from fitctl.commands.shared.options import (
     ControllerOption,
     JsonOption,
-    RigOption,
     SeedOption,
     SetOption,
+    ShippedRigOption,
 )
 from fitctl.commands.shared.plant import require_plant
 from fitctl.commands.shared.printing import progress_line, say, say_lines, to_json
@@ -39,7 +39,7 @@ from fitctl.simulation.statistics import MetrologyResult, SimulationResult
 
 
 def simulate(
-    rig: RigOption = None,
+    rig: ShippedRigOption = None,
     overrides: SetOption = None,
     controller: ControllerOption = None,
     seed: SeedOption = 0,
@@ -57,7 +57,7 @@ def simulate(
     """Acquire and hold a star on a virtual clock: the same supervisor and plant, much faster.
 
     With --runs, prints means, percentiles and the worst seeds of many runs. Each seed gives the same run alone
-    and among others.
+    and among others. Exit status 1 if a loop did not reach its star or beam.
     """
     settings = rig_of(rig, with_controller(rig, overrides, controller))
     require_plant(settings)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from fitctl.commands.shared.options import ControllerOption, ParentOption, RigOption, SetOption
+from fitctl.commands.shared.options import ControllerOption, OwnRigOption, ParentOption, SetOption
 from fitctl.commands.shared.printing import say
 from fitctl.commands.shared.rig import named_rig, rig_of, with_controller
 from fitctl.config import default_rig_path
@@ -12,7 +12,7 @@ from fitctl.stages.realtime import bound_memory
 
 
 def run(
-    rig: RigOption = None,
+    rig: OwnRigOption = None,
     overrides: SetOption = None,
     controller: ControllerOption = None,
     parent_pid: ParentOption = None,

@@ -60,9 +60,9 @@ def send(
     shutdown) has succeeded or failed. Elsewhere, it waits only with --wait.
 
     Exit status: 0 if the command was accepted and, with --wait, succeeded. 1 if it was refused, failed or was
-    ended by another command, or if no supervisor answers. 2 for a mistake on the command line. 3 if no
-    supervisor runs. 4 if the command is still under way after --timeout. 130 after Ctrl-C, which ends the
-    waiting, not the command.
+    ended by another command, or if no supervisor answers. 2 for a mistake on the command line. 3 if you named
+    no rig and no supervisor runs. 4 if the command is still under way after --timeout. 130 after Ctrl-C, which
+    ends the waiting, not the command.
     """
     wanted = command_of(command, values or [], loop)
     if remote is None and named_rig(rig) is None and not overrides and isinstance(wanted, Stop):

@@ -19,6 +19,7 @@ from fitctl.commands.shared.options import (
     RigOption,
     SeedOption,
     SetOption,
+    ShippedRigOption,
 )
 from fitctl.commands.shared.present import present_of_rig
 from fitctl.commands.shared.printing import progress_line, say, say_lines, to_json
@@ -77,6 +78,16 @@ def _load(file: Path, rig: Path | None, overrides: list[str] | None) -> tuple[Ri
     return settings, load_sequence(find_sequence(file), settings, of_steps)
 
 
+def _addressed(file: Path, rig: Path | None, overrides: list[str] | None) -> tuple[Path, list[str]]:
+    """The rig file and overrides of the instrument that the command addresses, for a sequence."""
+    from fitctl.sequences.reading import read_sequence
+
+    read_sequence(find_sequence(file))  # what is wrong with the file is reported first
+    values, steps = _parted(overrides)
+    found = address("sequence", rig, values)
+    return found.file, [*found.settings, *steps]
+
+
 def _parted(overrides: list[str] | None) -> tuple[list[str], list[str]]:
     """Overrides of the rig file, and those of the sequence."""
     of_steps = [text for text in overrides or () if text.startswith("steps.")]
@@ -115,7 +126,7 @@ def list_(
 @app.command()
 def check(
     file: SequenceArgument,
-    rig: RigOption = None,
+    rig: ShippedRigOption = None,
     overrides: StepSetOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -131,11 +142,15 @@ def check(
 @app.command("dry-run")
 def dry_run(
     file: SequenceArgument,
-    rig: RigOption = None,
+    rig: ShippedRigOption = None,
     overrides: StepSetOption = None,
     seed: SeedOption = 0,
     present: Annotated[
-        bool, typer.Option("--present", help="Start from the stages and stars of the running rig.")
+        bool,
+        typer.Option(
+            "--present",
+            help="Start from the stages and stars of the rig that fitctl sequence run addresses.",
+        ),
     ] = False,
     remote: RemoteOption = None,
     as_json: JsonOption = False,
@@ -149,6 +164,8 @@ def dry_run(
     """
     from fitctl.sequences.links import SimulatedLink
 
+    if present and remote is None:
+        rig, overrides = _addressed(file, rig, overrides)
     settings, sequence = _load(file, rig, overrides)
     settings.mock_parts()
     begun = time.perf_counter()
@@ -181,13 +198,8 @@ def run(
 
     Ctrl-C ends the present step and the sequence; the loops release their stars.
     """
-    from fitctl.sequences.reading import read_sequence
-
     if remote is None:
-        read_sequence(find_sequence(file))  # what is wrong with the file is reported first
-        values, steps = _parted(overrides)
-        found = address("sequence", rig, values)
-        rig, overrides = found.file, [*found.settings, *steps]
+        rig, overrides = _addressed(file, rig, overrides)
     settings, sequence = _load(file, rig, overrides)
     client = client_of(settings, remote)
     show_rig(settings.name, str(rig or remote))
@@ -202,7 +214,7 @@ def run(
 def pause(rig: RigOption = None, overrides: SetOption = None, remote: RemoteOption = None) -> None:
     """Pause the running sequence.
 
-    It pauses after the present step, or at once within the steps hold and wait.
+    It pauses at once within the steps hold and wait, and otherwise before the next attempt at a step.
     """
     _steer("pause", rig, overrides, remote)
 

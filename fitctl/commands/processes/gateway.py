@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 
 from fitctl.clock import MonotonicClock
-from fitctl.commands.shared.options import ParentOption, RigOption, SetOption
+from fitctl.commands.shared.options import ParentOption, SetOption, ShippedRigOption
 from fitctl.commands.shared.rig import rig_of
 from fitctl.messages.endpoints import checked_folder
 from fitctl.processes import end_with_parent, ended_by_signals
@@ -13,7 +13,7 @@ from fitctl.service.gateway import Gateway, be_modest, show_life
 
 
 def gateway(
-    rig: RigOption = None, overrides: SetOption = None, parent_pid: ParentOption = None
+    rig: ShippedRigOption = None, overrides: SetOption = None, parent_pid: ParentOption = None
 ) -> None:
     """Let keys in by TCP; the supervisor starts this by itself."""
     settings = rig_of(rig, overrides)

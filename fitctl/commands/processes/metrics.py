@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 
-from fitctl.commands.shared.options import ParentOption, RigOption, SetOption
+from fitctl.commands.shared.options import ParentOption, SetOption, ShippedRigOption
 from fitctl.commands.shared.rig import rig_of
 from fitctl.commands.shared.supervisor import client_of
 from fitctl.processes import end_with_parent, ended_by_signals
@@ -12,7 +12,7 @@ from fitctl.service.metrics import serve_metrics
 
 
 def metrics(
-    rig: RigOption = None, overrides: SetOption = None, parent_pid: ParentOption = None
+    rig: ShippedRigOption = None, overrides: SetOption = None, parent_pid: ParentOption = None
 ) -> None:
     """Serve metrics of the running instrument; the supervisor starts this by itself."""
     settings = rig_of(rig, overrides)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from pathlib import Path
 
-from fitctl.commands.shared.options import ParentOption, RigOption, SetOption
+from fitctl.commands.shared.options import ParentOption, SetOption, ShippedRigOption
 from fitctl.commands.shared.rig import rig_of
 from fitctl.logging.recorder import record as record_messages
 from fitctl.logging.records import RecorderStatus
@@ -18,7 +18,7 @@ _REPORT_TIMEOUT_S = 0.5
 
 
 def record(
-    rig: RigOption = None, overrides: SetOption = None, parent_pid: ParentOption = None
+    rig: ShippedRigOption = None, overrides: SetOption = None, parent_pid: ParentOption = None
 ) -> None:
     """Record what a supervisor sends; the supervisor starts this by itself."""
     settings = rig_of(rig, overrides)

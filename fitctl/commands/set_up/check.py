@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from fitctl.commands.shared.options import JsonOption, RigOption, SetOption
+from fitctl.commands.shared.options import JsonOption, OwnRigOption, SetOption
 from fitctl.commands.shared.plant import check_plant
 from fitctl.commands.shared.printing import say, to_json
 from fitctl.commands.shared.rig import named_rig
@@ -25,7 +25,7 @@ def check(
     file: Annotated[
         Path | None, typer.Argument(metavar="RIG", help="Rig file, in place of --rig.")
     ] = None,
-    rig: RigOption = None,
+    rig: OwnRigOption = None,
     overrides: SetOption = None,
     show: Annotated[
         bool,

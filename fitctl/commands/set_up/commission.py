@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from fitctl.commands.shared.exits import FAILED, INTERRUPTED
-from fitctl.commands.shared.options import JsonOption, RigOption, SetOption
+from fitctl.commands.shared.options import JsonOption, OwnRigOption, SetOption
 from fitctl.commands.shared.printing import say, to_json
 from fitctl.commands.shared.rig import named_rig
 from fitctl.commands.shared.terminal import has_terminal
@@ -38,7 +38,7 @@ _CHANGE = "{:<56} {:>12} {:>12} {:>9}"  # a figure of two commissionings
 
 
 def commission(
-    rig: RigOption = None,
+    rig: OwnRigOption = None,
     overrides: SetOption = None,
     yes: Annotated[
         bool, typer.Option("--yes", help="Do not ask before a step; for mocks only.")
@@ -46,7 +46,8 @@ def commission(
     only: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="STEP", help="Do only this step, even if it was done; may be repeated."
+            metavar="STEP",
+            help="Do only this step, even if it was done. You can give this option several times.",
         ),
     ] = None,
     until: Annotated[str, typer.Option(metavar="STEP", help="Stop when this step is done.")] = "",
@@ -83,9 +84,9 @@ def commission(
 ) -> None:
     """Commission a rig: prove it step by step, correct its rig file, and stop at the first trouble.
 
-    Each step prints what it will move and by how much, asks once, and stops by itself at the first sign of
-    the unexpected. What was done is kept beside the rig file; the next call goes on from there. No
-    supervisor may run. Exit status 1 if a step fails or is not done.
+    Each step prints what it will move and by how much, asks once, and stops if something unexpected happens.
+    fitctl records finished steps beside the rig file, and continues there next time. No supervisor may run.
+    Exit status 1 if a step fails or is not done.
     """
     path = named_rig(rig) or default_rig_path()
     settings = load_rig(path, overrides or ())

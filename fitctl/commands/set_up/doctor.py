@@ -16,7 +16,7 @@ from rich.text import Text
 
 from fitctl.commands.operate.status import newest_telemetry
 from fitctl.commands.shared.exits import FAILED
-from fitctl.commands.shared.options import JsonOption, RigOption, SetOption
+from fitctl.commands.shared.options import JsonOption, OwnRigOption, SetOption
 from fitctl.commands.shared.printing import say, to_json
 from fitctl.commands.shared.rig import named_rig, rig_of
 from fitctl.commands.shared.supervisor import client_of
@@ -32,7 +32,9 @@ _WIDEST = 118
 _FIRST_REPORT_S = 3.0
 
 
-def doctor(rig: RigOption = None, overrides: SetOption = None, as_json: JsonOption = False) -> None:
+def doctor(
+    rig: OwnRigOption = None, overrides: SetOption = None, as_json: JsonOption = False
+) -> None:
     """Check that the devices of a rig answer. Sets nothing and moves nothing.
 
     Reads the identity of each device. While the supervisor of the rig runs, prints what the supervisor

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from fitctl.commands.shared.options import JsonOption, RigOption, SetOption
+from fitctl.commands.shared.options import JsonOption, OwnRigOption, SetOption
 from fitctl.commands.shared.printing import say, to_json
 from fitctl.commands.shared.rig import named_rig, rig_of
 from fitctl.messages.keys import allowed_keys, new_key, revoke_key
@@ -36,7 +36,7 @@ def new(
         Path | None,
         typer.Option(metavar="FILE", help="Key file to write. [default: NAME.key.toml]"),
     ] = None,
-    rig: RigOption = None,
+    rig: OwnRigOption = None,
     overrides: SetOption = None,
 ) -> None:
     """Allow a person in, and write their key file.
@@ -52,7 +52,9 @@ def new(
 
 
 @app.command("list")
-def list_(rig: RigOption = None, overrides: SetOption = None, as_json: JsonOption = False) -> None:
+def list_(
+    rig: OwnRigOption = None, overrides: SetOption = None, as_json: JsonOption = False
+) -> None:
     """List the allowed keys and their roles."""
     keys, problems = allowed_keys(rig_of(named_rig(rig), overrides))
     if as_json:
@@ -65,7 +67,7 @@ def list_(rig: RigOption = None, overrides: SetOption = None, as_json: JsonOptio
 
 
 @app.command()
-def revoke(name: NameArgument, rig: RigOption = None, overrides: SetOption = None) -> None:
+def revoke(name: NameArgument, rig: OwnRigOption = None, overrides: SetOption = None) -> None:
     """Revoke a key.
 
     A running supervisor disconnects its holder at once.

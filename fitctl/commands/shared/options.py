@@ -3,20 +3,30 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from fitctl.commands.shared import completion
 
-RigOption = Annotated[
-    Path | None,
-    typer.Option(
+
+def _rig_option(default: str) -> Any:
+    """Which rig, and which one without the option: see "Which rig a command addresses" in docs/operating.md."""
+    return typer.Option(
         "--rig",
         metavar="FILE",
-        help="Rig file. [default: FITCTL_RIG, the running rig, or fit-mock.toml]",
+        help=f"Rig file. [default: {default}]",
         autocompletion=completion.rigs,
-    ),
+    )
+
+
+RigOption = Annotated[
+    Path | None, _rig_option("FITCTL_RIG, the running rig, or with --set fit-mock.toml")
+]
+OwnRigOption = Annotated[Path | None, _rig_option("FITCTL_RIG, or fit-mock.toml")]
+ShippedRigOption = Annotated[Path | None, _rig_option("fit-mock.toml")]
+DesignedRigOption = Annotated[
+    Path | None, _rig_option("fit-mock.toml, or for learn the rig in the log")
 ]
 SetOption = Annotated[
     list[str] | None,

@@ -14,9 +14,9 @@ from fitctl.commands.shared.exits import FAILED
 from fitctl.commands.shared.options import (
     ControllerOption,
     JsonOption,
-    RigOption,
     SeedOption,
     SetOption,
+    ShippedRigOption,
 )
 from fitctl.commands.shared.printing import progress_line, say, say_lines, to_json
 from fitctl.commands.shared.rig import rig_of, with_controller
@@ -36,7 +36,7 @@ _CONSOLE_END_S = 3.0
 
 
 def demo(
-    rig: RigOption = None,
+    rig: ShippedRigOption = None,
     overrides: SetOption = None,
     seed: SeedOption = 0,
     duration: Annotated[
@@ -55,7 +55,7 @@ def demo(
     """Run the whole instrument on mock devices: acquire a star and hold it.
 
     On a terminal, the demo opens the console. Without a terminal, or with --headless, it runs for --duration
-    seconds and prints a summary.
+    seconds and prints a summary; its exit status is then 1 if a loop did not reach its star or beam.
     """
     if testbed and rig is not None:
         msg = "demo: --testbed is the rig rigs/fit-testbed.toml; leave out --testbed, or --rig"

@@ -24,7 +24,8 @@ app = typer.Typer(help="Inject faults into running mocks.")
 DeviceArgument = Annotated[
     str,
     typer.Argument(
-        help="camera, or a loop's drive, dac or mdt693, such as right.mdt693.",
+        help="camera, hexapod, or LOOP.PART such as right.mdt693, where PART is drive, adapter (CAN), dac, "
+        "mdt693 or labjack.",
         autocompletion=completion.devices,
     ),
 ]

@@ -16,9 +16,9 @@ from pydantic import TypeAdapter, ValidationError
 from fitctl.commands.shared.options import (
     JsonOption,
     ParentOption,
-    RigOption,
     SeedOption,
     SetOption,
+    ShippedRigOption,
 )
 from fitctl.commands.shared.printing import say, to_json
 from fitctl.commands.shared.rig import rig_of
@@ -37,7 +37,7 @@ _PRIORITY = 40  # below all threads of the supervisor
 
 
 def mocks(
-    rig: RigOption = None,
+    rig: ShippedRigOption = None,
     overrides: SetOption = None,
     seed: SeedOption = 0,
     as_json: JsonOption = False,

@@ -181,9 +181,11 @@ def check_design(site: Site) -> Outcome:
     safe = [name for name, one in found.items() if one[1].excess(required) <= 1]
     if not safe:
         msg = (
-            f"no design keeps {required.phase_margin_deg:g} degrees and {required.gain_margin_db:g} dB with "
-            "this delay and air path; shorten camera.frame_delay_s or raise the frame rate, or make a design "
-            "by hand (docs/designing.md)"
+            f"no design keeps all margins with this delay and air path (phase {required.phase_margin_deg:g} "
+            f"degrees, gain {required.gain_margin_db:g} dB, peak sensitivity {required.peak_sensitivity:g}, "
+            f"stable for mirror gains from {required.least_gain:g} to {required.greatest_gain:g} and "
+            f"{1e3 * required.delay_s:g} ms more or less delay); shorten camera.frame_delay_s or raise the "
+            "frame rate, or make a design by hand (docs/designing.md)"
         )
         raise StepError(msg, figures)
     least_px = min(found[name][0].residual_px for name in safe)

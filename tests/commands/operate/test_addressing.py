@@ -106,7 +106,14 @@ def test_one_that_hangs_does_not_keep_the_others_from_being_stopped(night, fitct
 
 @pytest.mark.parametrize(
     "command",
-    [["send", "stop"], ["send", "status"], ["status"], ["sequence", "pause"], ["watch"]],
+    [
+        ["send", "stop"],
+        ["send", "status"],
+        ["status"],
+        ["sequence", "pause"],
+        ["sequence", "dry-run", "acquire", "--present"],
+        ["watch"],
+    ],
     ids=" ".join,
 )
 def test_where_none_runs_there_is_one_line(night, fitctl, command):
