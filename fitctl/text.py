@@ -9,6 +9,8 @@ from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 import msgspec
 
 _T = TypeVar("_T")
+UNDECODABLE = (msgspec.MsgspecError, UnicodeDecodeError, RecursionError)
+"""What msgspec raises for bytes from elsewhere: they do not fit, are no text, or are nested a thousand deep."""
 _NO_TEXT = {int, float, bool, bytes, types.NoneType}
 
 

@@ -16,6 +16,7 @@ from fitctl.commissioning.outcome import DONE, Outcome, State
 from fitctl.config import ConfigError
 from fitctl.config.reading import lay_over
 from fitctl.files import read_regular, replaced_whole
+from fitctl.text import UNDECODABLE
 
 _MOST_BYTES = 16 << 20
 
@@ -184,7 +185,7 @@ def load_any(path: Path) -> Commissioning:
     """
     try:
         return msgspec.json.decode(read_regular(path, _MOST_BYTES), type=Commissioning)
-    except (OSError, msgspec.MsgspecError, UnicodeDecodeError) as error:
+    except (OSError, *UNDECODABLE) as error:
         msg = f"{path}: cannot be read as a record of a commissioning: {error}; name or move it"
         raise ConfigError(msg) from None
 

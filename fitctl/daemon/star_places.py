@@ -12,6 +12,7 @@ import msgspec
 
 from fitctl.files import read_regular
 from fitctl.logging.records import StarPlace
+from fitctl.text import UNDECODABLE
 
 FILE = "stars.json"  # in the socket folder
 _MOST_BYTES = 65536
@@ -41,7 +42,7 @@ class StarPlaces:
             return msgspec.json.decode(
                 read_regular(self._path, _MOST_BYTES), type=list[StarPlace], strict=True
             )
-        except (OSError, msgspec.MsgspecError):
+        except (OSError, *UNDECODABLE):
             return []
 
     def write(self, places: Sequence[StarPlace]) -> None:

@@ -311,6 +311,9 @@ def refused_report(report: LearnerReport) -> str:
     )
     if not all(math.isfinite(px) and px >= 0 for px in figures_px):
         return f"a learner's report needs finite residuals, got {figures_px}"
+    if report.design_json and not report.design_json.startswith("{"):
+        # Nothing else: a name with .py would be a file to run, and reports are also read from logs.
+        return "a learner's report has the parameters of a design, a JSON object; this report has other text"
     if report.worth_it and not (report.design_json and 0 < report.learnt_px < report.present_px):
         return "a design that is worth a change leaves less than the present one; this report's does not"
     return ""

@@ -24,7 +24,7 @@ from fitctl.messages.endpoints import (
 )
 from fitctl.messages.keys import RemoteKey
 from fitctl.messages.telemetry import Telemetry
-from fitctl.text import plain, plain_message
+from fitctl.text import UNDECODABLE, plain, plain_message
 
 REPLY_TIMEOUT_S = 2.0
 _REFUSED_TIMEOUT_S = 1.0
@@ -242,6 +242,6 @@ class Client:
 def _decoded(decode: Callable[[bytes], _T], payload: bytes, what: str) -> _T:
     try:
         return plain_message(decode(payload))
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+    except UNDECODABLE as error:
         msg = f"{what} ({plain(str(error))}) is unreadable; is the supervisor of another version of fitctl?"
         raise ConnectionError(msg) from error

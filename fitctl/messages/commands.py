@@ -13,6 +13,7 @@ import msgspec
 from fitctl.config import CONTROLLERS, ControllerName, Motion
 from fitctl.logging.records import Event, RecorderStatus, SequenceAttempt
 from fitctl.model.drives import Drive
+from fitctl.text import UNDECODABLE
 
 PROTOCOL_VERSION = 1
 ControllerChoice = ControllerName | Literal["learnt"]
@@ -295,7 +296,7 @@ def decode_command(payload: bytes) -> AnyCommand | Reply:
     """A command as it came, or a refusal with the reason."""
     try:
         command = _decode(payload)
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+    except UNDECODABLE as error:
         return Reply(accepted=False, text=f"not a command: {str(error)[:_QUOTED]}")
     if command.version != PROTOCOL_VERSION:
         text = f"this supervisor speaks version {PROTOCOL_VERSION}, not {command.version}"

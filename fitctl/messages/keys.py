@@ -20,6 +20,7 @@ import msgspec
 import zmq
 
 from fitctl.config import ConfigError, Rig
+from fitctl.text import UNDECODABLE
 
 Role = Literal["commander", "viewer"]
 KeyText = Annotated[str, msgspec.Meta(pattern=r"^[!-~]{40}$")]  # Z85, 32 bytes
@@ -246,7 +247,7 @@ def _read(path: Path, kind: type[T]) -> T:
     except OSError as error:
         msg = f"{path}: cannot be read: {error.strerror}; `fitctl keys new` makes key files"
         raise ConfigError(msg) from None
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+    except UNDECODABLE as error:
         msg = f"{path}: is not a key file of fitctl: {error}; `fitctl keys new` makes them"
         raise ConfigError(msg) from None
 

@@ -11,6 +11,7 @@ import msgspec
 from fitctl.config import ConfigError
 from fitctl.messages.endpoints import open_folder, supervisor_name, supervisor_names
 from fitctl.processes import names_held
+from fitctl.text import UNDECODABLE
 
 RUNNING_FILE = "rig.json"  # in the socket folder
 _MOST_BYTES = 65536
@@ -116,7 +117,7 @@ def _read(folder: Path) -> RunningRig | None:
         with open(file, "rb") as reading:
             running = msgspec.json.decode(reading.read(_MOST_BYTES), type=RunningRig)
         os.kill(running.pid, 0)
-    except (OSError, msgspec.MsgspecError):
+    except (OSError, *UNDECODABLE):
         return None
     finally:
         os.close(opened)

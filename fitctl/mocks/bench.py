@@ -20,6 +20,7 @@ from fitctl.mocks.faults import Faults, UnknownFault, check_fault
 from fitctl.model.metrology.fringes import mean_visibility
 from fitctl.model.plant import Plant
 from fitctl.model.stellar_part import StellarPart
+from fitctl.text import UNDECODABLE
 
 _MAX_QUESTION_BYTES = 1024
 _TIMEOUT_MS = 5000
@@ -256,7 +257,7 @@ class Bench:
     def _answer(self, message: bytes) -> Residual | Beam | Visibility | StagesNow | FaultsNow:
         try:
             question = msgspec.msgpack.decode(message, type=_AnyQuestion)
-        except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        except UNDECODABLE as error:
             return Residual(np.nan, np.nan, 0, f"not a question: {error}")
         match question:
             case ResidualQuestion():

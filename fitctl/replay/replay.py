@@ -62,6 +62,7 @@ from fitctl.replay.result import (
 from fitctl.stages.journal import Journal
 from fitctl.stages.siderostat import SiderostatStage
 from fitctl.supervisor.supervisor import Supervisor
+from fitctl.text import UNDECODABLE
 
 # Who commands is not replayed; a sequence leads to commands of its own, which are in the log as well. What a
 # collector that moves does to the stars and the beam is in what was measured, and when frames came is logged.
@@ -176,13 +177,13 @@ class Replay:
 
     def _post(self, message: Any) -> None:
         try:
-            arguments = msgspec.json.decode(message.values_json)
+            arguments = msgspec.json.decode(message.values_json, type=dict[str, Any])
             given = arguments | {
                 "type": _RENAMED.get(message.command, message.command),
                 "loop": message.loop,
             }
             command = msgspec.convert(given, AnyCommand)
-        except msgspec.MsgspecError as error:
+        except UNDECODABLE as error:
             self._answered(message, Reply(accepted=False, text=f"not a command: {error}"))
             return
         self._supervisor.post(command, lambda reply: self._answered(message, reply))

@@ -10,6 +10,7 @@ import msgspec
 
 from fitctl.logging.records import Severity
 from fitctl.messages.keys import AllowedKey, Name, Role
+from fitctl.text import UNDECODABLE
 
 MAX_ENVELOPE_BYTES = 1_048_576  # a report of some ten thousand keys
 
@@ -34,7 +35,7 @@ def decode_envelope(payload: bytes) -> Passed | Report | None:
     """The gateway's message; None if the bytes are no envelope."""
     try:
         return _decode(payload)
-    except (msgspec.MsgspecError, UnicodeDecodeError):
+    except UNDECODABLE:
         return None
 
 

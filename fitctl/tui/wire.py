@@ -7,11 +7,10 @@ import threading
 import time
 from collections.abc import Callable
 
-import msgspec
-
 from fitctl.messages.client import Client
 from fitctl.messages.commands import AnyCommand, Reply
 from fitctl.messages.telemetry import Telemetry
+from fitctl.text import UNDECODABLE
 
 RECEIVE_TIMEOUT_S = 0.2
 EXIT_WAIT_S = 2.5
@@ -111,7 +110,7 @@ class Wire:
             telemetry = None
             try:
                 telemetry = self._link.receive(RECEIVE_TIMEOUT_S)
-            except (ConnectionError, msgspec.MsgspecError, UnicodeDecodeError) as error:
+            except (ConnectionError, *UNDECODABLE) as error:
                 if self._clock() >= notice_due_s:
                     notice_due_s = self._clock() + UNREADABLE_NOTICE_S
                     self._on_unreadable(str(error))

@@ -51,6 +51,13 @@ def test_a_folder_that_has_vanished_is_no_error(tmp_path):
     assert writer.read() == []
 
 
+@pytest.mark.parametrize("left", [b"", b"[1]", b'[{"loop":"\xff"}]', 2000 * b"["])
+def test_a_damaged_file_is_none(tmp_path, left):
+    (tmp_path / FILE).write_bytes(left)
+
+    assert StarPlaces(tmp_path).read() == []
+
+
 def test_one_that_ends_by_an_error_leaves_what_it_knew(tmp_path):
     with pytest.raises(RuntimeError), written(tmp_path, [PLACE]):
         raise RuntimeError

@@ -7,6 +7,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from samples.learner_reports import report
 from samples.replay_courses import hold_a_star
 
 from fitctl.cli import main
@@ -16,6 +17,11 @@ from fitctl.controllers.design.document import design_json
 from fitctl.logging.exporting import export
 from fitctl.logging.reading import log_info
 from fitctl.logging.records import ControllerChange, Event
+from fitctl.logging.schemas import MESSAGES
+from fitctl.messages.command_table import command_record
+from fitctl.messages.commands import Reply, SetController
+from fitctl.replay.log import Logged, LoggedStep
+from fitctl.replay.replay import Replay
 from tests.samples.logged_simulation import LoggedSimulation
 
 PLANTED = "planted-by-the-log"
@@ -115,6 +121,33 @@ def test_no_file_that_a_log_names_is_opened(tmp_path, monkeypatch, opened_paths)
     replay_and_report(log, tmp_path, monkeypatch)
 
     assert [path for path in opened_paths if PLANTED in path] == []
+
+
+@pytest.mark.parametrize("name", ["planted.py", "planted.json"])
+def test_no_report_of_a_learner_names_a_design_to_run(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / name).write_text("open('ran', 'w')")
+    replay = Replay(load_rig(default_rig_path()))
+    commands = (report(design_json=name), SetController(name="learnt", loop="right"))
+    steps = [command_record(one, Reply(accepted=True), "anna", "here", 1.0) for one in commands]
+    change = ControllerChange(
+        time_s=1.0,
+        loop="right",
+        source="eq20",
+        target=name,
+        siderostat_az_rad=0.0,
+        siderostat_el_rad=0.0,
+        design_json="",
+    )
+    for records in (steps, [change]):
+        step = LoggedStep()
+        step.begin = [
+            Logged(type(one), MESSAGES[type(one)](**msgspec.structs.asdict(one))) for one in records
+        ]
+        replay.play(step)
+
+    assert not (tmp_path / "ran").exists()
+    assert "the parameters of a design" in replay.result.refused[0]
 
 
 def test_a_topic_is_no_path_to_export_to(tmp_path, monkeypatch):

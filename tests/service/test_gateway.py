@@ -82,6 +82,7 @@ def test_on_its_own_socket_the_gateway_speaks_for_a_key(served, say):
     [
         b"",
         b"\xc1",
+        b"\x81\xa1x" + 2000 * b"\x91",  # nested deeply
         STOP,
         msgspec.msgpack.encode(msgspec.structs.replace(OF_ANNA, name="root@here")),
         msgspec.msgpack.encode(msgspec.structs.replace(OF_ANNA, role="owner")),

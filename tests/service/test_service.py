@@ -80,6 +80,7 @@ def test_stop_takes_the_velocity_before_the_loop_even_looks(served):
     [
         (b"", "truncated"),
         (b"\xff\xff\xff", "not a command"),
+        (b"\x81\xa1x" + 2000 * b"\x91", "not a command"),  # nested deeply
         (b"\x81\xa4type\xa4\xff\xfe\xff\xfe", "not a command"),
         (b"\x82\xa4type\xa4Stop\xa4loop\xa2\xff\xfe", "not a command"),
         (msgspec.msgpack.encode({"type": "Explode"}), "Explode"),

@@ -47,13 +47,13 @@ def design_for(
     """
     chosen = controller or rig.stellar_loops[loop_name].vernier.controller
     its_basis = basis(rig, loop_name)
-    if chosen.endswith(".json"):
+    if chosen.startswith("{"):  # first: whatever parameters end with, they are no file
+        design = _learnt(chosen, its_basis)
+    elif chosen.endswith(".json"):
         design = load_design(Path(chosen), its_basis, DESIGNS)
     elif chosen.endswith(SUFFIX):
         with solving(f"controller {chosen}", loop_name):
             design = own_design(Path(chosen), its_basis)
-    elif chosen.startswith("{"):
-        design = _learnt(chosen, its_basis)
     elif chosen in DESIGNS:
         with solving(f"controller {chosen}", loop_name):
             design = DESIGNS[chosen](replace(its_basis, noise_px=noise_px or its_basis.noise_px))

@@ -36,7 +36,7 @@ from fitctl.logging.records import (
 from fitctl.logging.schemas import TOPICS
 from fitctl.logging.seeking import SeekableLog
 from fitctl.messages.telemetry import LoopState, Telemetry, Unlogged
-from fitctl.text import plain, plain_message
+from fitctl.text import UNDECODABLE, plain, plain_message
 from fitctl.tui.rewind.moment import Moment, course_from_s, until
 
 LAG_S = 3.0  # the recorder has a record at most so long after its time
@@ -301,7 +301,7 @@ def _state_of(snapshot: Snapshot) -> Unlogged | None:
         return None
     try:
         state = plain_message(_decode_state(snapshot.state_msgpack))
-    except (msgspec.MsgspecError, UnicodeDecodeError):
+    except UNDECODABLE:
         return None
     sound = _all_bounded(msgspec.to_builtins(state)) and all(map(_is_sound, state.loops))
     if state.fringes is not None:
