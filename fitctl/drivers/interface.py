@@ -402,8 +402,11 @@ class Hexapod(Protocol):
         """Connect and check the device and its travel against the rig file; nothing moves."""
         ...
 
-    def reference(self) -> None:
-        """Start a reference move and wait until it has ended; the platform moves."""
+    def reference(self, is_wanted: Callable[[], bool] = lambda: True) -> None:
+        """Start a reference move and wait until it has ended; the platform moves.
+
+        It is stopped as soon as `is_wanted` is false, for a stop that came just before the move began.
+        """
         ...
 
     def move_to(self, pose: Pose, velocity_mm_s: float) -> None:

@@ -229,7 +229,7 @@ class SimulatedHexapod:
         """Nothing to connect."""
         return _identity("hexapod")
 
-    def reference(self) -> None:
+    def reference(self, _is_wanted: Callable[[], bool] = lambda: True) -> None:
         """It knows where it is, and takes no time to find out."""
         self._referenced = True
 

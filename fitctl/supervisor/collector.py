@@ -138,7 +138,9 @@ class CollectorWatch:
     def close(self) -> None:
         """Stop what moves, and disconnect; waits for that."""
         self._stops += 1
-        if self.drive.running:
+        if self.is_open and (
+            self.drive.running or self._busy
+        ):  # a reference move is busy, and no course
             self._stop()
         for thread in self._threads:
             thread.join(_CLOSE_TIMEOUT_S)
@@ -164,7 +166,7 @@ class CollectorWatch:
         if stops != self._stops:
             return "warning", _STOPPED_FIRST
         if motion is None:
-            self._hexapod.reference()
+            self._hexapod.reference(lambda: stops == self._stops)
             self.error = ""
             return "info", "referenced: all axes are at zero"
         self.drive.start(motion)

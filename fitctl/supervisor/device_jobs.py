@@ -172,7 +172,11 @@ class DeviceJobs:
             # Opening imports and parses: what the servo waited meanwhile is no stall of the machine.
             self._servos[name].drain_timing()
             loop.fire(trigger, _OPEN)
-        ended(f"STANDBY: {_OPEN}", failed=False)
+        elsewhere = [name for name in names if self._loops[name].mode is not Mode.STANDBY]
+        if elsewhere:
+            ended(f"{', '.join(elsewhere)} went to SAFE meanwhile; send recover", failed=True)
+        else:
+            ended(f"STANDBY: {_OPEN}", failed=False)
 
     def _log_opened(self, names: list[str], opened: Opened | None, error: str) -> None:
         for name in names:

@@ -38,7 +38,7 @@ class Starlight:
         self._first = round(FIRST_S / rig.camera.period_s)
         self._every = round(EVERY_S / rig.camera.period_s)
         self._design = loop.pointing.design
-        self._busy = False
+        self._remade: Design | None = None  # that is being made again, for another light
         self._begin()
 
     def _begin(self) -> None:
@@ -52,7 +52,7 @@ class Starlight:
             self._begin()
             return None
         star = loop.observation.star
-        if star is None or self._busy or not self._design.uses_noise:
+        if star is None or self._remade is not None or not self._design.uses_noise:
             return None
         self._frames += 1
         self._sum_dn += star.flux_dn
@@ -61,18 +61,19 @@ class Starlight:
         flux_dn = self._sum_dn / self._frames
         self._frames, self._needed, self._sum_dn = 0, self._every, 0.0
         noise_px = loop.star_finder.noise_px(flux_dn)
-        self._busy = noise_ratio(self._design, noise_px) > MOST_RATIO
-        return noise_px if self._busy else None
+        if noise_ratio(self._design, noise_px) <= MOST_RATIO:
+            return None
+        self._remade = self._design
+        return noise_px
 
     def designed(self, noise_px: float, future: Future) -> None:
         """Use the design that was made, unless the loop has another one by now."""
-        self._busy = False
-        error, before = future.exception(), self._design
+        error, before, self._remade = future.exception(), self._remade, None
         if error is not None:
             self._journal.event(
                 "warning", self.loop.name, f"no design for the star's light: {error_text(error)}"
             )
-        elif self.loop.pointing.design is before:
+        elif before is not None and self.loop.pointing.design is before:
             was_px = float(before.parameters["noise_px"])
             why = f"the star's light gives {noise_px:.4f} px of noise, not {was_px:.4f}"
             self.loop.use(future.result(), why, by_itself=True)

@@ -282,14 +282,14 @@ class Supervisor:
         Until it comes, mirrors are written that are due.
         Every loop has sent its stages what they are to do before the first waits for a confirmation.
         """
+        loops = self._in_order
+        were_safe = [loop.mode is Mode.SAFE for loop in loops]
         frame = self._camera.next_frame(self._write_due)
         self._finish_jobs()
         self._obey_posted()
         self._frame_rate.check()
         self._record_left()
         lost = self._camera.counts.lost if self._camera.ready else 0
-        loops = self._in_order
-        were_safe = [loop.mode is Mode.SAFE for loop in loops]
         for loop in loops:
             loop.sense(frame, lost, self._camera.skipped)
             loop.decide()
@@ -336,8 +336,9 @@ class Supervisor:
         )
 
     def stop(self, reason: str) -> None:
-        """Every loop to SAFE, and the collector stopped."""
+        """Every loop to SAFE, the collector stopped, and devices that are being opened closed again."""
         self._stop_collector()
+        self._device_jobs.abandon(list(self.loops))
         for loop in self.loops.values():
             loop.fire(Trigger.STOP, reason)
         now_s = self._clock.now_s()
@@ -358,10 +359,13 @@ class Supervisor:
         self._obey_posted()
         self._closed = True  # devices that answer slowly keep nobody waiting for an answer
         self._end_posted()
-        if self.collector is not None:
-            self.collector.close()
-        self._device_jobs.close_all()
-        self._record_left()
+        self._stop_collector()
+        try:
+            self._device_jobs.close_all()
+        finally:
+            if self.collector is not None:
+                self.collector.close()
+            self._record_left()
 
     def _stop_collector(self) -> None:
         if self.collector is not None:

@@ -11,7 +11,9 @@ from serial.urlhandler import protocol_socket
 from fitctl.clock import MonotonicClock
 from fitctl.config import Fault, default_rig_path, load_rig
 from fitctl.drivers.c887.driver import C887Hexapod
+from fitctl.drivers.interface import DeviceTimeout
 from fitctl.messages.commands import MoveCollector, Standby, Stop
+from fitctl.messages.modes import Mode
 from fitctl.mocks.c887.server import C887ControllerMock
 from fitctl.simulation.simulation import Simulation
 from fitctl.stages.periodic import PeriodicThread
@@ -231,6 +233,32 @@ def test_a_stop_ends_a_reference_move(watched):
     assert not watch.error
 
 
+def test_a_reference_move_that_begins_just_after_a_stop_is_stopped(watched, monkeypatch):
+    watch, mock = watched
+    reference = watch._hexapod.reference
+
+    def after_a_stop(is_wanted):
+        watch.stop()
+        until(lambda: not watch._stopping, "the end of the stop")
+        reference(is_wanted)
+
+    monkeypatch.setattr(watch._hexapod, "reference", after_a_stop)
+    watch.obey(MoveCollector(action="reference"))
+    reported(watch, "all axes referenced")
+
+    assert not mock.platform.referenced
+
+
+def test_a_watch_that_is_closed_ends_a_reference_move(watched):
+    watch, mock = watched
+    watch.obey(MoveCollector(action="reference"))
+    until(lambda: mock.platform.referencing, "a reference move")
+    watch.close()
+
+    assert not mock.platform.referencing
+    assert not mock.platform.referenced
+
+
 @pytest.mark.parametrize("kind", ["motion_error", "emergency_stop", "disconnect", "silent"])
 def test_a_fault_on_the_way_is_an_event_and_the_collector_is_no_longer_moved(watched, kind):
     watch, mock = watched
@@ -264,6 +292,28 @@ def test_the_supervisor_s_stop_stops_the_collector():
     simulation.run(0.5)
     assert simulation.hexapod.pose().pose == here.pose
     assert not simulation.supervisor.collector.drive.running
+
+
+def unanswered(*_arguments, **_settings):
+    raise DeviceTimeout("device", "here", "an answer", "none")
+
+
+@pytest.mark.parametrize("device", ["siderostat", "piezo amplifier", "camera"])
+def test_the_collector_stops_when_a_device_takes_a_loop_to_safe(monkeypatch, device):
+    simulation = drifting()
+    right = simulation.devices.loops["right"]
+    owner, call = {
+        "siderostat": (right.amplifiers, "exchange"),
+        "piezo amplifier": (right.piezo, "stack_volts"),
+        "camera": (simulation.camera, "next_frame"),
+    }[device]
+    monkeypatch.setattr(owner, call, unanswered)
+    for _ in range(500):
+        simulation.supervisor.step()
+
+    assert simulation.supervisor.loops["right"].mode is Mode.SAFE
+    assert not simulation.supervisor.collector.drive.running
+    assert not simulation.hexapod.pose().moving
 
 
 def test_a_supervisor_that_ends_leaves_no_collector_moving():

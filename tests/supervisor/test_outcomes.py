@@ -19,7 +19,7 @@ from fitctl.messages.commands import (
     Standby,
     Stop,
 )
-from fitctl.messages.modes import Mode
+from fitctl.messages.modes import Mode, Trigger
 from fitctl.simulation.devices import InlineExecutor
 
 SILENT = DeviceTimeout("piezo right", "/dev/ttyUSB0", "an answer in 1 s", "none", "is it on?")
@@ -160,6 +160,32 @@ def test_opening_that_is_stopped_fails_and_says_so(fresh, monkeypatch):
     assert found.state == "failed"
     assert found.text.startswith("stopped while opening; when ready, recover")
     assert state(fresh).last_failure.text == found.text
+
+
+def test_a_shutdown_while_devices_are_opened_leaves_safe_alone(fresh, monkeypatch):
+    executor = SlowExecutor()
+    fresh.command(Stop())
+    monkeypatch.setattr(fresh.supervisor._device_jobs, "_executor", executor)
+    reply = fresh.command(Recover())
+    fresh.supervisor.stop("shutting down")
+    for _ in range(2):  # opened, closed
+        executor.finish()
+        fresh.run(0.1)
+
+    assert outcome(fresh, reply.number).state == "failed"
+    assert state(fresh).mode == "SAFE"
+
+
+def test_a_loop_that_goes_to_safe_while_its_devices_are_opened_has_failed(fresh, monkeypatch):
+    executor = SlowExecutor()
+    monkeypatch.setattr(fresh.supervisor._device_jobs, "_executor", executor)
+    reply = fresh.command(Standby())
+    fresh.supervisor.loops["right"].fire(Trigger.STOP, "an interlock")
+    executor.finish()
+    fresh.run(0.1)
+
+    found = outcome(fresh, reply.number)
+    assert (found.state, found.text) == ("failed", "right went to SAFE meanwhile; send recover")
 
 
 def test_while_devices_are_opened_a_command_is_refused_with_what_to_wait_for(fresh, monkeypatch):

@@ -17,7 +17,7 @@ from fitctl.simulation.batch.batch import Batch
 from fitctl.simulation.batch.settings import BatchRefusalError
 from fitctl.simulation.simulation import Simulation
 from fitctl.simulation.statistics import true_residual_rms
-from fitctl.supervisor.starlight import Starlight
+from fitctl.supervisor.starlight import FIRST_S, Starlight
 
 FAINT_DN = 7000.0  # 0.04 px of noise, as the rig file's 28000 DN have 0.01
 
@@ -163,13 +163,21 @@ def test_a_design_from_a_file_stays_as_it_is(tmp_path):
 def test_a_design_that_comes_too_late_is_not_used():
     simulation = held(rig_of(28000.0))
     loop = loop_of(simulation)
+    simulation.supervisor._design_jobs._starlight.clear()
     light = Starlight(simulation.rig, loop, loop._journal)
+    loop.use(design_for(simulation.rig, "right", "minimum-variance", 0.02))
+    noise_px = None
+    for _ in range(2 * round(FIRST_S / simulation.rig.camera.period_s)):
+        simulation.run(simulation.rig.camera.period_s)
+        noise_px = noise_px or light.observe()
     late = Future()
-    late.set_result(design_for(simulation.rig, "right", "minimum-variance", 0.02))
+    late.set_result(design_for(simulation.rig, "right", "minimum-variance", noise_px))
 
     loop.use(design_for(simulation.rig, "right", "eq20"))
-    light.designed(0.02, late)
+    light.observe()
+    light.designed(noise_px, late)
 
+    assert noise_px == pytest.approx(0.01, rel=0.1)
     assert loop.controller == "eq20"
 
 

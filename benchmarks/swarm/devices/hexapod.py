@@ -52,13 +52,16 @@ class SwarmHexapod(SimulatedHexapod):
             self.line.ask(lambda: None)
         return super().open()
 
-    def reference(self) -> None:
+    def reference(self, is_wanted: Callable[[], bool] = lambda: True) -> None:
         """Make a reference move, which takes seconds."""
         self.line.ask(lambda: None)
         ends_s = self._time.now_s() + _REFERENCE_S
         while self._time.now_s() < ends_s:
             self._time.sleep(0.1)
             self.line.ask(lambda: None)
+            if not is_wanted():
+                self.stop()
+                raise self._refusal("all axes referenced", "a stop", "reference it again")
         super().reference()
 
     def move_to(self, pose: Pose, velocity_mm_s: float) -> None:

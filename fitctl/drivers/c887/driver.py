@@ -74,8 +74,13 @@ class C887Hexapod:
             raise
         return identity
 
-    def reference(self) -> None:
+    def reference(self, is_wanted: Callable[[], bool] = lambda: True) -> None:
         """Switch servos on that are off, reference all axes, and wait until that is done: the platform moves.
+
+        Parameters
+        ----------
+        is_wanted : callable
+            The move is stopped when this is false.
 
         Raises
         ------
@@ -94,6 +99,8 @@ class C887Hexapod:
         limit_s = self._device.reference_timeout_s
         deadline_s = time.monotonic() + limit_s
         while not link.ask(protocol.GET_READY, protocol.parse_ready):
+            if not is_wanted():
+                self.stop()
             if time.monotonic() > deadline_s:
                 self.stop()
                 raise self._endpoint.error(
