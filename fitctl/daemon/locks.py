@@ -72,7 +72,7 @@ def only_master(rig: Rig) -> Iterator[None]:
 def device_addresses(rig: Rig) -> dict[str, str]:
     """Addresses at which two masters could command one device at once, and what the rig has there.
 
-    The camera is not among them: it gives control to one master by itself.
+    The camera is not among them: it gives control to one master by itself. Photodiodes are only read.
     """
     found: dict[str, str] = {}
     for name, loop in rig.loops.items():
@@ -80,6 +80,8 @@ def device_addresses(rig: Rig) -> dict[str, str]:
         if isinstance(loop, Loop):
             found.setdefault(_modbus(loop.fsm.dac), f"{name} D/A")
             found.setdefault(_port(loop.fsm.piezo.port), f"{name} piezo")
+    if rig.collector is not None:
+        found.setdefault(_port(rig.collector.hexapod.port), "hexapod")
     return found
 
 

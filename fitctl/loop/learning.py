@@ -254,7 +254,8 @@ class Learning:
 
     @property
     def _before_px(self) -> float:
-        return math.nan if self._comparison is None else self._comparison.before_px
+        comparison = self._comparison  # read once: consoles' thread asks, and the loop may drop it
+        return math.nan if comparison is None else comparison.before_px
 
     # ------------------------------------------------------------ for consoles
 

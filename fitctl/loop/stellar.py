@@ -485,8 +485,8 @@ class StellarLoop(Loop):
         self.waits_for = waits_for
         if waits_for and not before:
             self._report_event("warning", f"waits for {waits_for}; the stages stay where they are")
-            if self.mode is Mode.EXPERIMENT:
-                self.fire(Trigger.EXPERIMENT_DONE, f"waits for {waits_for}")
+        if waits_for and self.mode is Mode.EXPERIMENT:
+            self.fire(Trigger.EXPERIMENT_DONE, f"waits for {waits_for}")
         if waits_for or self.mode not in TRACKING:
             return
         if before:

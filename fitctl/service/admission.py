@@ -66,6 +66,7 @@ class Admission:
             return f"{holder} has the instrument; to take it over: fitctl send take-over"
         if needs == "the instrument" or isinstance(command, TakeOver):
             self._holder, self._heard_s = sender.name, now_s
-        elif holder == sender.name:
+        elif holder == sender.name and needs != "the Unix socket":
+            # Recorder and learner report by themselves, under the name of the user who started them.
             self._heard_s = now_s
         return ""

@@ -54,6 +54,7 @@ class DesignJobs:
         self._design = design
         self._jobs: deque[Job] = deque()
         self._wanted: dict[str, Future] = {}  # of each loop, by its last `controller` command
+        self._learning: dict[str, Future] = {}  # of each loop, by its learner's last report
         self._starlight = [Starlight(rig, loop, journal) for loop in loops.values()]
 
     @property
@@ -129,11 +130,18 @@ class DesignJobs:
         if news:
             self._journal.event("info", loop.name, news)
         if loop.learning.wants_change(self._clock.now_s()):
-            self._make(partial(self._learnt, loop, report), loop.name, report.design_json)
+            if loop.name in self._learning:
+                self._learning[
+                    loop.name
+                ].cancel()  # if it has not begun: a newer report counts more
+            done = partial(self._learnt, loop, report)
+            self._learning[loop.name] = self._make(done, loop.name, report.design_json)
             self.finish()
 
     def _learnt(self, loop: StellarLoop, report: LearnerReport, future: Future) -> None:
         """Use a learnt design, if the loop is still calm; the learner's next report comes soon."""
+        if future.cancelled():
+            return
         error = future.exception()
         if error is not None:
             self._journal.event("warning", loop.name, f"no learnt design: {error_text(error)}")

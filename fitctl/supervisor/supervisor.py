@@ -456,8 +456,9 @@ class Supervisor:
     def _obey_for_loops(self, command: AnyCommand, names: list[str]) -> str:
         if isinstance(command, Experiment) and self._frame_rate.active:
             self._frame_rate.end()
-            if self._device_jobs.busy:  # and so the camera waits
-                return "the camera's usual rate is being set; try again"
+            return (
+                "the camera runs at another frame rate, and its usual one is being set; try again"
+            )
         return obey_loop_command(self.rig, [self.loops[name] for name in names], command)
 
     def _why_no_other_rate(self) -> str:

@@ -155,6 +155,16 @@ def test_two_nodes_of_one_can_channel_may_have_two_masters():
     assert set(drives[0]) - set(drives[1]) == {"socketcan:can0 node 1"}
 
 
+def test_a_hexapod_has_one_master():
+    rig = load_rig(default_rig_path().parent / "fit-testbed.toml")
+    port = rig.collector.hexapod.port
+
+    (address,) = (
+        address for address, device in device_addresses(rig).items() if device == "hexapod"
+    )
+    assert port.endswith(address)
+
+
 def test_the_drive_and_the_piezo_of_a_rig_have_addresses_of_their_own(rig):
     assert sorted(device_addresses(rig).values()) == [
         "right D/A",

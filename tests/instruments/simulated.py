@@ -1,6 +1,9 @@
 """Small words for statements about an instrument on the virtual clock."""
 
+from concurrent.futures import Future
+
 from fitctl.logging.records import Event
+from fitctl.simulation.devices import InlineExecutor
 
 NEAR = {"star_offset_px": (10.0, -6.0)}
 TWO_STARS = (
@@ -39,3 +42,25 @@ def failing(error):
         raise error
 
     return fail
+
+
+class SlowExecutor(InlineExecutor):
+    """Device work is done at once, but that is known only once `finish` was called."""
+
+    def __init__(self):
+        self._waiting = []
+
+    def submit(self, fn, /, *args, **kwargs):
+        done, shown = super().submit(fn, *args, **kwargs), Future()
+        self._waiting.append((done, shown))
+        return shown
+
+    def finish(self):
+        for done, shown in self._waiting:
+            if not shown.set_running_or_notify_cancel():
+                continue
+            if (error := done.exception()) is not None:
+                shown.set_exception(error)
+            else:
+                shown.set_result(done.result())
+        self._waiting.clear()

@@ -165,6 +165,20 @@ def test_an_experiment_needs_a_star_in_hand(simulate_with):
     assert not simulation.command(Experiment(loop="right", name="try", drives=[SWEEP])).accepted
 
 
+def test_no_experiment_is_made_while_the_loop_waits(held, monkeypatch):
+    simulation, loop, _ = held()
+    loop.waits_for = "the link of metrology"
+    monkeypatch.setattr(loop, "_why_wait", lambda *_: "the link of metrology")
+
+    reply = simulation.command(Experiment(loop="right", name="try", drives=[SWEEP]))
+    assert not reply.accepted
+    assert "waits for the link of metrology" in reply.text
+
+    loop.start_experiment("try", [SWEEP])  # at the same moment as the wait
+    simulation.run(0.1)
+    assert loop.mode is not Mode.EXPERIMENT
+
+
 @pytest.mark.parametrize(
     ("change", "why"),
     [

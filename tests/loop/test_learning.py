@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from instruments.simulated import SlowExecutor
 from samples.learner_reports import PAPER, SHAKEN, report
 
 from fitctl.config import default_rig_path, load_rig
@@ -214,6 +215,20 @@ def test_a_change_says_why_and_has_the_design(shaken):
     assert (change.source, change.target) == ("minimum-variance", "learnt")
     assert "would leave 0.0240 px instead of 0.1000" in change.reason
     assert '"learnt": true' in change.design_json
+
+
+@pytest.mark.long
+def test_a_newer_report_replaces_one_whose_design_has_not_been_begun(shaken, monkeypatch):
+    executor = SlowExecutor()
+    monkeypatch.setattr(shaken.simulation.supervisor._design_jobs, "_executor", executor)
+    for learnt_px in (0.026, 0.025, 0.024):
+        assert shaken.report(learnt_px=learnt_px).accepted
+        shaken.simulation.run(0.1)
+    executor.finish()
+    shaken.simulation.run(0.1)
+
+    (change,) = shaken.changes()
+    assert "would leave 0.0240 px instead of 0.1000" in change.reason
 
 
 @pytest.mark.long

@@ -2,10 +2,12 @@
 
 import pytest
 
+from fitctl.logging.records import RecorderStatus
 from fitctl.messages.command_table import ROWS
 from fitctl.messages.commands import (
     Acquire,
     RecentEvents,
+    RecorderReport,
     Release,
     SequenceControl,
     Status,
@@ -18,6 +20,7 @@ ANNA = Sender("anna", "10.0.0.1", "commander", is_local=False)
 OWNER = Sender("owner@here", "process 7", "commander", is_local=True)
 BOB = Sender("bob", "10.0.0.2", "viewer", is_local=False)
 LEASE_S = 30.0
+NOTHING = RecorderStatus(time_s=0.0, path="", records=0, lost=0, bytes_written=0)
 
 
 @pytest.fixture
@@ -51,6 +54,19 @@ def test_who_takes_over_has_it(admission):
     assert admission.refusal(OWNER, TakeOver(), 1.0) == ""
     assert admission.commander(1.0) == "owner@here"
     assert "owner@here has the instrument" in admission.refusal(ANNA, Release(), 2.0)
+
+
+@pytest.mark.parametrize(
+    ("command", "after"), [(Status(), "owner@here"), (RecorderReport(status=NOTHING), "")]
+)
+def test_what_people_send_keeps_the_lease_and_what_processes_report_does_not(
+    admission, command, after
+):
+    admission.refusal(OWNER, Acquire(), 0.0)
+    for now_s in range(2 * round(LEASE_S)):
+        assert admission.refusal(OWNER, command, float(now_s)) == ""
+
+    assert admission.commander(2 * LEASE_S) == after
 
 
 @pytest.mark.parametrize("command", [Stop(), SequenceControl(action="pause"), Status()])

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from instruments.simulated import NEAR, events_of, failing, until
+from instruments.simulated import NEAR, SlowExecutor, events_of, failing, until
 from samples.learner_reports import report
 
 from fitctl.config import default_rig_path, load_rig
@@ -143,12 +143,33 @@ def test_an_experiment_has_the_rigs_rate(held):
     drive = Drive(
         channel="siderostat_az", shape="sine", amplitude=2.0, frequency_hz=1.0, duration_s=2.0
     )
+    reply = held.command(Experiment(name="sine", drives=[drive]))
+    assert not reply.accepted
+    assert "its usual one is being set; try again" in reply.text
+    held.run(0.2)
     assert held.command(Experiment(name="sine", drives=[drive])).accepted
     held.run(1.0)
 
     assert held.ticks[-1].mode == "EXPERIMENT"
     assert period_s(held) == pytest.approx(USUAL_S)
     assert "an experiment needs the rig's frame rate" in why_not(held, rate_hz=47.0)
+
+
+def test_no_experiment_is_made_before_the_camera_has_the_rigs_rate(held, monkeypatch):
+    assert why_not(held, rate_hz=48.0, duration_s=60.0) == ""
+    held.run(1.0)
+    setting = SlowExecutor()
+    monkeypatch.setattr(held.supervisor._frame_rate, "_executor", setting)
+    drive = Drive(
+        channel="siderostat_az", shape="sine", amplitude=2.0, frequency_hz=1.0, duration_s=2.0
+    )
+    for _ in range(3):
+        assert not held.command(Experiment(name="sine", drives=[drive])).accepted
+        held.run(0.5)
+
+    setting.finish()
+    held.run(0.5)
+    assert held.command(Experiment(name="sine", drives=[drive])).accepted
 
 
 # ---------------------------------------------------------------- cameras that do not obey

@@ -1,10 +1,10 @@
 """Every accepted command that takes time ends once in each loop, and a failure stays until another command."""
 
 import threading
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from instruments.simulated import NEAR, darken, events_of, failing, until
+from instruments.simulated import NEAR, SlowExecutor, darken, events_of, failing, until
 
 from fitctl.drivers.interface import DeviceTimeout
 from fitctl.messages.command_table import COMMANDS
@@ -20,7 +20,6 @@ from fitctl.messages.commands import (
     Stop,
 )
 from fitctl.messages.modes import Mode, Trigger
-from fitctl.simulation.devices import InlineExecutor
 
 SILENT = DeviceTimeout("piezo right", "/dev/ttyUSB0", "an answer in 1 s", "none", "is it on?")
 
@@ -44,26 +43,6 @@ def ended(simulation, reply, limit_s=40.0):
         assert simulation.clock.now_s() < end_s, "it does not end"
         simulation.run(0.1)
     return outcome(simulation, reply.number)
-
-
-class SlowExecutor(InlineExecutor):
-    """Device work is done at once, but that is known only once `finish` was called."""
-
-    def __init__(self):
-        self._waiting = []
-
-    def submit(self, fn, /, *args, **kwargs):
-        done, shown = super().submit(fn, *args, **kwargs), Future()
-        self._waiting.append((done, shown))
-        return shown
-
-    def finish(self):
-        for done, shown in self._waiting:
-            if (error := done.exception()) is not None:
-                shown.set_exception(error)
-            else:
-                shown.set_result(done.result())
-        self._waiting.clear()
 
 
 @pytest.fixture

@@ -68,6 +68,19 @@ def test_an_experiment_ends_when_its_stages_are_held(action):
     assert bench.loop.last_change.reason == bench.tripped["frame_age"].reason
 
 
+@pytest.mark.parametrize("action", ["freeze", "flatten"])
+def test_no_experiment_begins_while_the_stages_are_held(action):
+    bench = with_action(action)
+    late_frames(bench)
+    assert bench.until(lambda: bench.tripped, 2.0)
+    drive = Drive(channel="fsm_az", shape="sine", amplitude=0.1, frequency_hz=1.0, duration_s=60.0)
+
+    reply = bench.simulation.command(Experiment(name="sine", drives=[drive]))
+
+    assert not reply.accepted
+    assert "an interlock keeps the stages where they are: frame_age" in reply.text
+
+
 def test_a_stop_of_a_loop_that_is_safe_leaves_the_fault_as_its_reason():
     bench = struck("frame_missing")
     assert bench.until(lambda: bench.loop.mode is Mode.SAFE, 2.0)
