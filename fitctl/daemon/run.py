@@ -67,6 +67,7 @@ _GATEWAY_PATIENCE_S = 2.0  # without it nobody elsewhere can give a stop
 _HOUSEKEEPING_S = 1.0
 _WIND_DOWN_S = 1.0
 _DEAF = "the service thread has died, so no command could stop the rig any more; see the traceback above"
+_STILL = "a thread that drives stages has died, so they would follow no command any more"
 _VERSIONED = (
     "fitctl",
     "numpy",
@@ -197,7 +198,7 @@ def run_supervisor(
         on_ready(folder)
         tell_service_manager(READY)
         try:
-            _loop(supervisor, service, housekeep, children, machine, clock, ending)
+            _loop(supervisor, service, threads, housekeep, children, machine, clock, ending)
         finally:
             gc.enable()
             for thread in threads:
@@ -268,6 +269,7 @@ def _designer() -> Iterator[ThreadPoolExecutor]:
 def _loop(
     supervisor: Supervisor,
     service: Service,
+    threads: Sequence[PeriodicThread],
     housekeep: Callable[[], None],
     children: Sequence[Child],
     machine: Machine,
@@ -290,6 +292,9 @@ def _loop(
                 machine.look()
                 if not service.is_alive():
                     raise RuntimeError(_DEAF)
+                for thread in threads:
+                    if thread.error is not None:
+                        raise RuntimeError(_STILL) from thread.error
                 tell_service_manager(ALIVE, status_line(supervisor.modes_of(supervisor.loops)))
         tell_service_manager(ENDING)
         supervisor.shutdown_wanted = True

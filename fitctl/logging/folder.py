@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import math
 import re
@@ -128,12 +127,12 @@ def prune(folder: Path, rig_name: str, settings: Logging, now: datetime) -> Prun
     -------
     Pruned
     """
-    logs = sorted(_logs_of(folder, rig_name))
+    pruned = Pruned([], [])
+    logs = sorted(_logs_of(folder, rig_name, pruned.refused))
     total_bytes = sum(log.size_bytes for log in logs)
     kept_bytes = 0
     retain_s = timedelta(days=settings.retain_days).total_seconds()
     ages_s, pause_s = _ages_s([log.written_s for log in logs], now.timestamp(), retain_s)
-    pruned = Pruned([], [])
     if logs and ages_s[0] <= retain_s < now.timestamp() - logs[0].written_s:
         pruned.refused.append(
             f"{folder}: no log was written for {pause_s / _DAY_S:.0f} days, or the computer's clock is wrong; "
@@ -178,14 +177,21 @@ class _Log(NamedTuple):
     size_bytes: int
 
 
-def _logs_of(folder: Path, rig_name: str) -> Iterator[_Log]:
+def _logs_of(folder: Path, rig_name: str, refused: list[str]) -> Iterator[_Log]:
+    """The logs of a rig; `refused` gets a line for each that cannot be examined."""
     name = log_name(rig_name)
     for path in folder.glob("*.mcap"):
         found = name.fullmatch(path.name)
-        with contextlib.suppress(FileNotFoundError):  # somebody else deletes too
-            if found:
-                status = path.stat()
-                yield _Log(max(status.st_mtime, _start_s(found[1])), path, status.st_size)
+        if not found:
+            continue
+        try:
+            status = path.stat()
+        except FileNotFoundError:
+            continue  # somebody else deletes too
+        except OSError as error:
+            refused.append(f"{path}: cannot be examined, so it is not deleted: {error.strerror}")
+            continue
+        yield _Log(max(status.st_mtime, _start_s(found[1])), path, status.st_size)
 
 
 def _start_s(stamp: str) -> float:

@@ -97,6 +97,9 @@ class LoggedPictures:
                 f"{width_px} x {height_px}; set camera.width_px and camera.height_px, or name another log"
             )
             raise LogError(msg)
+        if len(frame.data) != 2 * frame.height * frame.width:
+            msg = f"{self._path}: has a frame of {len(frame.data)} bytes, which are not two for each pixel"
+            raise LogError(msg)
         return _Picture(
             entry.publish_time_ns, np.frombuffer(frame.data, "<u2").reshape(self._shape)
         )

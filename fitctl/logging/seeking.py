@@ -136,8 +136,9 @@ class SeekableLog:
                 yield from self._inside(content, from_ns, to_ns, wanted)
 
     def _scan(self, stream: IO[bytes]) -> None:
-        at, metadata_bytes, newest = len(MCAP0_MAGIC), 0, None
-        unknown: set[int] = set()
+        at, metadata_bytes = len(MCAP0_MAGIC), 0
+        newest: _ChunkPlace | None = None
+        unpacked: _ChunkPlace | None = None
         while True:
             stream.seek(at)
             head = stream.read(_RECORD.size)
@@ -156,9 +157,9 @@ class SeekableLog:
             elif opcode == Opcode.MESSAGE_INDEX and newest is not None:
                 (channel,) = _CHANNEL.unpack(stream.read(_CHANNEL.size))
                 newest.channels.add(channel)
-                if channel not in self._channels and channel not in unknown:
+                if channel not in self._channels and newest is not unpacked:  # each chunk once
+                    unpacked = newest
                     self._learn_channels(self._unpack(stream, newest))
-                    unknown.add(channel)
             elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
                 self._learn_channels(head + stream.read(min(size, MOST_METADATA_BYTES)))
             elif opcode == Opcode.METADATA and metadata_bytes + size <= MOST_METADATA_BYTES:

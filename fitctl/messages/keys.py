@@ -20,6 +20,7 @@ import msgspec
 import zmq
 
 from fitctl.config import ConfigError, Rig
+from fitctl.files import open_regular
 from fitctl.text import UNDECODABLE
 
 Role = Literal["commander", "viewer"]
@@ -234,7 +235,7 @@ def _read(path: Path, kind: type[T]) -> T:
     Its mode is asked of the open file, so that it is the one that is read.
     """
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             mode = stat.S_IMODE(os.fstat(file.fileno()).st_mode)
             text = file.read(65536)
         if mode & 0o077:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import math
+from array import array
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -97,7 +98,7 @@ class _RandomVelocity:
     def __init__(self, motion: CollectorMotion, seed: int) -> None:
         self._motion = motion
         self._random = np.random.default_rng([seed, 887])
-        self._way_mm = [0.0]
+        self._way_mm = array("d", [0.0])
         self._velocity_mm_s = motion.rms_mm_s * self._random.standard_normal()
 
     def __call__(self, time_s: float) -> float:

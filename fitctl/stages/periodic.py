@@ -26,9 +26,16 @@ class Periodic(Protocol):
 
 
 class PeriodicThread:
-    """Runs something periodic with absolute deadlines; a missed deadline is skipped, never made up."""
+    """Runs something periodic with absolute deadlines; a missed deadline is skipped, never made up.
+
+    Attributes
+    ----------
+    error : Exception or None
+        What has ended it before it was stopped.
+    """
 
     def __init__(self, work: Periodic, clock: Clock) -> None:
+        self.error: Exception | None = None
         self._work = work
         self._clock = clock
         self._ending = threading.Event()
@@ -46,6 +53,14 @@ class PeriodicThread:
         self._work.threaded = False
 
     def _run(self) -> None:
+        try:
+            self._go_on()
+        except Exception as error:
+            self._work.threaded = False  # nobody waits for this thread any more
+            self.error = error
+            raise
+
+    def _go_on(self) -> None:
         become_realtime(priority=60)
         period_s = self._work.period_s
         deadline_s = self._clock.now_s() + period_s

@@ -270,6 +270,16 @@ def test_one_log_that_cannot_be_deleted_keeps_none_of_the_others(tmp_path, monke
     assert [why.partition(": ")[0] for why in pruned.refused] == [str(folder), str(stuck)]
 
 
+def test_one_log_that_cannot_be_examined_keeps_none_of_the_others(tmp_path):
+    stuck, gone = (tmp_path / name_of(day) for day in (1, 2))
+    stuck.symlink_to(stuck.name)  # leads to itself
+    aged(tmp_path, gone.name, 401, 10)
+    pruned = prune(tmp_path, "bench", limits(1, 365), NOW)
+
+    assert pruned.deleted == [gone]
+    assert [why.partition(": ")[0] for why in pruned.refused] == [str(stuck)]
+
+
 def test_recording_goes_on_where_something_else_has_an_old_logs_name(tmp_path):
     folder = tmp_path / name_of(1)
     folder.mkdir()

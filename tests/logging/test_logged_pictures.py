@@ -1,5 +1,6 @@
 """A log's frames as the mock camera asks for them."""
 
+import msgspec
 import numpy as np
 import pytest
 from samples.log_samples import RUN_INFO, frame, tick, write_log
@@ -51,6 +52,16 @@ def test_in_a_gap_the_last_frame_stays_and_after_the_end_it_is_dark_and_told_onc
     assert all(np.all(dark == 1000) for dark in shown[6:])
     (why,) = pictures.said
     assert why.endswith("its frames are over")
+
+
+def test_a_frame_with_too_little_data_ends_the_pictures(pictures):
+    short = msgspec.structs.replace(at(1), data=at(1).data[:-2])
+    picture = pictures(at(0), short, at(2))
+    for count in range(4):
+        picture(count * PERIOD_S)
+
+    (why,) = pictures.said
+    assert "has a frame of 3198 bytes" in why
 
 
 def test_a_log_without_frames_is_refused(pictures):

@@ -1,6 +1,9 @@
 """A log is read from any time on, finished or torn, and never more of it than is allowed."""
 
+import struct
+
 import pytest
+from mcap.opcode import Opcode
 
 from fitctl.logging import seeking
 from fitctl.logging.errors import LogError
@@ -42,6 +45,24 @@ def test_only_the_messages_of_a_time_are_read(path):
     assert numbers(log, 700, 710) == list(range(700, 711))
     assert log.span_ns == (round(WALL_S * 1e9), round((WALL_S + COUNT - 1) * 1e9))
     assert log.metadata["rig"]["name"] == RUN_INFO.rig_name
+
+
+def test_each_chunk_is_unpacked_once_whatever_channels_its_indexes_name(path, monkeypatch):
+    last = max(SeekableLog(path)._chunks, key=lambda chunk: chunk.offset)
+    end = last.offset + 9 + last.size
+    strange = [struct.pack("<BQHI", Opcode.MESSAGE_INDEX, 6, 1000 + n, 0) for n in range(500)]
+    path.write_bytes(path.read_bytes()[:end] + b"".join(strange))
+    unpack, unpacked = SeekableLog._unpack, []
+
+    def counted(log, stream, place):
+        unpacked.append(place.offset)
+        return unpack(log, stream, place)
+
+    monkeypatch.setattr(SeekableLog, "_unpack", counted)
+    log = SeekableLog(path)
+
+    assert unpacked.count(last.offset) == 1
+    assert numbers(log, 700, 710) == list(range(700, 711))
 
 
 def test_a_torn_log_is_read_to_its_tear(path):

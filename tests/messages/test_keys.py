@@ -150,7 +150,8 @@ def test_anything_that_is_no_key_file_is_refused_in_one_line(tmp_path, content):
     assert len(str(refused.value).splitlines()) == 1
 
 
-def test_a_missing_file_and_a_folder_are_told(tmp_path):
-    for path in (tmp_path, tmp_path / "none.toml"):
+def test_a_missing_file_a_folder_and_a_pipe_are_told(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path, tmp_path / "none.toml", tmp_path / "pipe"):
         with pytest.raises(ConfigError, match="cannot be read"):
             read_remote(path)

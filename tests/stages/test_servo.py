@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from fitctl.clock import VirtualClock
+from fitctl.clock import MonotonicClock, VirtualClock
 from fitctl.config import default_rig_path, load_rig
 from fitctl.drivers.interface import DeviceFault, DeviceIdentity, DeviceTimeout, ServoReading
 from fitctl.stages.periodic import PeriodicThread
@@ -437,6 +437,21 @@ def test_the_thread_keeps_its_rate_and_ends(amplifiers):
 
     # A missed deadline is skipped, so there may be fewer periods than time for them, never more.
     assert 0.3 * gone_s / 0.002 < periods <= gone_s / 0.002 + 20
+
+
+def test_a_thread_that_dies_says_why_and_keeps_nobody_waiting(amplifiers, monkeypatch):
+    clock = MonotonicClock()
+    monkeypatch.setattr("threading.excepthook", lambda _: None)  # which prints
+    servo = SiderostatServo(
+        "right", load_rig(default_rig_path()).loops["right"], amplifiers, clock, 0.02
+    )
+    thread = PeriodicThread(servo, clock)
+    monkeypatch.setattr(servo, "wait", lambda: 1 / 0)
+    thread.start()
+    thread._thread.join(5.0)
+
+    assert isinstance(thread.error, ZeroDivisionError)
+    servo.close()
 
 
 class Interruption:
