@@ -270,7 +270,7 @@ class Invariants:
                 "lease and rights are kept", f"{sender.name}, {name}, {holder!r} has it: {refusal}"
             )
         takes = name not in _FOR_ALL | _OF_THIS_MACHINE | _OF_COMMANDERS or name == "TakeOver"
-        if may and (takes or holder == sender.name):
+        if may and (takes or (holder == sender.name and name not in _OF_THIS_MACHINE)):
             self._lease = sender.name, now_s
 
     def posted(self, command: AnyCommand) -> None:
@@ -288,9 +288,7 @@ class Invariants:
         now_s = self._clock.now_s()
         if isinstance(command, Stop | MoveCollector):  # a stop of whichever loop
             stops = isinstance(command, Stop) or command.action == "stop"
-            if not (stops and self._collector_is_stopped):
-                self._stopped_for.clear()
-            self._collector_is_stopped = stops
+            self._collector_is_to_stop(is_so=stops)
         for name in self._named(command):
             if isinstance(command, Stop):
                 self._stop_answered_s[name] = now_s
@@ -300,6 +298,11 @@ class Invariants:
                 self._power_up_s[name] = now_s
             elif isinstance(command, Look):
                 self._pointed_at.add(name)
+
+    def _collector_is_to_stop(self, *, is_so: bool) -> None:
+        if not (is_so and self._collector_is_stopped):
+            self._stopped_for.clear()
+        self._collector_is_stopped = is_so
 
     def _named(self, command: AnyCommand) -> list[str]:
         return [name for name in self._rig.loops if command.loop in {"", name}]
@@ -389,6 +392,8 @@ class Invariants:
         name = change.loop
         if change.target == Mode.ACQUISITION.name:
             self._pointed_at.discard(name)
+        if change.target == Mode.SAFE.name and change.source != Mode.SAFE.name:
+            self._collector_is_to_stop(is_so=True)
         if change.target == Mode.STANDBY.name and change.source in {"OFF", "SAFE"}:
             self._stopped_s.pop(name, None)
             stop_s = self._stop_answered_s.get(name, -math.inf)
@@ -589,7 +594,7 @@ class Invariants:
             )
 
     def _collector_rests(self, now_s: float) -> None:
-        """A stop of any loop, or of the collector, brings the platform to rest."""
+        """A stop of any loop or of the collector, or a loop that goes to SAFE, brings the platform to rest."""
         hexapod = self.hexapod
         if hexapod is None:
             return
@@ -603,7 +608,8 @@ class Invariants:
         # A course is many short moves: between two of them the platform is at rest.
         if stopped_s > _COLLECTOR_RESTS_S and hexapod.moves:
             self.violated(
-                "a stop stops the collector", f"it moves {stopped_s:.2f} s after the stop"
+                "a stop stops the collector",
+                f"it moves {stopped_s:.2f} s after a stop, or after SAFE",
             )
 
     def _power(self, name: str, mode: Mode, *, busy: bool, now_s: float) -> None:

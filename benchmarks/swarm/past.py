@@ -157,6 +157,11 @@ def _goes_on_in(mode: Mode) -> Callable[[Loop, Mode, Any], None]:
     return enter
 
 
+def _without_collector(self: Supervisor, loop: Loop, *, was_safe: bool) -> None:
+    if was_safe:
+        _MAKE_SAFER(self, loop, was_safe=True)
+
+
 def _find_nothing(self: MirrorStage) -> None:
     self._known_s = self._clock.now_s()
 
@@ -169,6 +174,7 @@ _POSITION_SERVO_INIT = PositionServo.__init__
 _FAIL = SiderostatServo._fail
 _ENTER = Loop._enter
 _SUPERVISOR_INIT = Supervisor.__init__
+_MAKE_SAFER = Supervisor._make_safer
 
 DEFECTS = {
     "power-race": Defect(
@@ -274,6 +280,11 @@ DEFECTS = {
         "09991ea",
         "a loop drives its siderostat on after another loop's star, which it cannot move",
         [(StellarLoop, "_find_unmoved", lambda _self, _star: None)],
+    ),
+    "collector-in-safe": Defect(
+        "fbf2d6c",
+        "the collector goes on when a loop goes to SAFE",
+        [(Supervisor, "_make_safer", _without_collector)],
     ),
     "jog-in-off": Defect(
         "ac43419",

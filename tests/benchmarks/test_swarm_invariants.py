@@ -8,6 +8,7 @@ import pytest
 from benchmarks.swarm.devices.hexapod import SwarmHexapod
 from benchmarks.swarm.invariants import Invariants
 from benchmarks.swarm.lines import FAULTS, WRONG, Line
+from benchmarks.swarm.past import put_back
 from benchmarks.swarm.plan import Order, Plan, Strike, devices_of
 from benchmarks.swarm.run import RIGS as FOLDER
 from benchmarks.swarm.run import run_plan
@@ -357,6 +358,19 @@ def test_a_collector_that_goes_on_after_a_stop_is_found(monkeypatch):
     monkeypatch.setattr(CollectorDrive, "stop", lambda _: None)
 
     assert "a stop stops the collector" in run(*happenings, rig=TESTBED, duration_s=14.0)
+
+
+@pytest.mark.long
+def test_a_collector_that_goes_on_when_a_loop_loses_its_camera_is_found():
+    happenings = (
+        Order(at_s=0.1, who="ada", command=Standby()),
+        Order(at_s=4.0, who="ada", command=MoveCollector(action="reference")),
+        Order(at_s=12.0, who="ada", command=MoveCollector(action="start")),
+        Strike(at_s=13.5, device="camera", fault="mute", lasts_s=8.0),
+    )
+    assert run(*happenings, rig=TESTBED, duration_s=20.0) == set()
+    with put_back("collector-in-safe"):
+        assert "a stop stops the collector" in run(*happenings, rig=TESTBED, duration_s=20.0)
 
 
 @pytest.mark.long
