@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from fitctl.controllers.design.linear_loop.spectrum import seen_at_hz
 from fitctl.learn.night import LEAST_LINE_HZ, LearntLine, Night, guess_of
 from fitctl.learn.opened import Opened, Series, periodograms
-from fitctl.learn.whittle import likeliest
+from fitctl.learn.whittle import LineGuess, likeliest
 from fitctl.loop.frame_rate import OTHER_RATE, frames_watched
 
 Floats = NDArray[np.float64]
@@ -36,7 +36,10 @@ _ROUNDS = 3
 _STAYS_HZ = 0.2
 """So far a line may be from where it is expected, and so wide,"""
 _BROADER = 3.0
-"""or so many times as wide as the night has it: beyond that it explains something else."""
+"""or so many times as wide as the night has it, and so much"""
+_WEAKER = 0.4
+"""of its RMS it must have: beyond that it explains something else. A narrow line has less for a seventh of the
+time, and is not classified then."""
 _SURE = 6.0
 """By how much the logarithm of the likelihood must be higher in one case: it is 400 times as likely."""
 
@@ -258,12 +261,17 @@ def _cost(night: Night, at_hz: Mapping[LearntLine, float], opened: Opened) -> fl
     begin = guess_of(night, seen_hz)
     # A mirror that may move otherwise than it did explains away a line that is not where it should be.
     end = likeliest(opened, begin, free_mirror=False)
-    stayed = tuple(
-        line
-        for line, found in zip(begin.lines, end.guess.lines, strict=True)
-        if abs(found.frequency_hz - line.frequency_hz) <= _STAYS_HZ
-        and found.half_width_hz <= max(_BROADER * line.half_width_hz, _STAYS_HZ)
-    )
+    both = zip(begin.lines, end.guess.lines, strict=True)
+    stayed = tuple(line for line, found in both if _is_that_line(line, found))
     if len(stayed) < len(begin.lines):  # a line that is not there has gone to explain another
         end = likeliest(opened, begin._replace(lines=stayed), free_mirror=False)
     return end.cost
+
+
+def _is_that_line(line: LineGuess, found: LineGuess) -> bool:
+    """Whether what a search has found is still the line with which it began."""
+    return (
+        abs(found.frequency_hz - line.frequency_hz) <= _STAYS_HZ
+        and found.half_width_hz <= max(_BROADER * line.half_width_hz, _STAYS_HZ)
+        and float(np.max(found.rms_px)) >= _WEAKER * float(np.max(line.rms_px))
+    )

@@ -145,6 +145,19 @@ def test_a_line_that_is_not_there_at_the_other_rate_is_not_classified(paper, fix
     assert estimated([series], paper, (), [AtOtherRate(slower.period_s, [without])])[2] == []
 
 
+@pytest.mark.parametrize("seed", [0, 2, pytest.param(4, marks=pytest.mark.long)])
+def test_a_weak_alias_makes_no_alias_of_a_strong_slow_line(paper, fixed, seed):
+    """At the other rate the slow line is hidden by the air."""
+    lines = (Line(1.0, 0.005, 0.045), Line(RATE_HZ + 1.05, 0.001, 0.009))
+    truth = dataclasses.replace(paper, lines=lines)
+    _, series = held(truth, fixed, TWO_MINUTES_S, seed)
+    period_s = 1 / classifying_rate([1.0], RATE_HZ)
+    _, other = held(dataclasses.replace(truth, period_s=period_s), fixed, OTHER_S, seed + 1)
+    classified = estimated([series], paper, (), [AtOtherRate(period_s, [other])])[2]
+
+    assert not any(one.is_alias for one in classified), classified
+
+
 # ---------------------------------------------------------------- asking
 
 
