@@ -21,6 +21,7 @@ from fitctl.drivers.interface import (
     CameraCounts,
     DeviceError,
     DeviceIdentity,
+    DeviceRefused,
     DiodeReading,
     Frame,
     ServoReading,
@@ -137,7 +138,8 @@ class LoggedCamera(NoDevice):
         return self._frames.popleft() if self._frames else None
 
     def set_frame_rate(self, rate_hz: float) -> None:
-        """The log has the frames as they came."""
+        """Refuse it: the log has the frames as they came, and experiments that were accepted."""
+        raise DeviceRefused(CAMERA, "log", f"{rate_hz:g} frames/s", "the frames as they came")
 
     def counts(self) -> CameraCounts:
         """Nobody decides by them."""
@@ -440,6 +442,8 @@ class LoggedExecutor(Executor):
             self._designs.append(((loop, title), waiting))
         elif fn is close_devices:
             future.set_result(None)
+        elif getattr(fn, "__func__", None) is LoggedCamera.set_frame_rate:
+            _end(_Waiting(future, (), lambda: fn(*args)))
         # What the piezo amplifier answers reaches its watch as the log has it.
         self._end_what_ends()
         return future

@@ -455,9 +455,8 @@ class Supervisor:
 
     def _obey_for_loops(self, command: AnyCommand, names: list[str]) -> str:
         if isinstance(command, Experiment) and self._frame_rate.active:
-            self._frame_rate.end()
             return (
-                "the camera runs at another frame rate, and its usual one is being set; try again"
+                "experiment needs the rig's frame rate; wait until the camera runs as usual again"
             )
         return obey_loop_command(self.rig, [self.loops[name] for name in names], command)
 

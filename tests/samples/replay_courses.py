@@ -241,7 +241,7 @@ def a_learnt_design(simulation):
 
 
 def another_frame_rate(simulation):
-    """By command, and for the learner, until an experiment ends it."""
+    """By command, and for the learner; then an experiment, which is refused meanwhile."""
     hold_a_star(simulation)
     simulation.run(3.0)
     assert simulation.command(FrameRate(rate_hz=48.0, duration_s=2.0)).accepted
@@ -249,9 +249,11 @@ def another_frame_rate(simulation):
     simulation.command(learner_report(worth_it=False, classifying_rate_hz=47.0))
     simulation.run(3.0)
     assert simulation.camera._period_s == 1 / 47.0
-    simulation.command(Experiment(loop="right", name="try", drives=SCAN))
-    simulation.run(2.5)
+    assert not simulation.command(Experiment(loop="right", name="try", drives=SCAN)).accepted
+    simulation.run(11.0)
     assert simulation.camera._period_s == 1 / 50.0
+    assert simulation.command(Experiment(loop="right", name="try", drives=SCAN)).accepted
+    simulation.run(2.5)
 
 
 def two_loops():
