@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from fitctl.controllers.design.linear_loop.spectrum import seen_at_hz
 from fitctl.learn.night import LEAST_LINE_HZ, LearntLine, Night, guess_of
 from fitctl.learn.opened import Opened, Series, periodograms
-from fitctl.learn.whittle import LineGuess, likeliest
+from fitctl.learn.whittle import Guess, LineGuess, likeliest
 from fitctl.loop.frame_rate import OTHER_RATE, frames_watched
 
 Floats = NDArray[np.float64]
@@ -220,10 +220,15 @@ def _shown(
             cost(*one) + likeliest(opened, guess_of(night, at_hz(one))).cost
             for one in with_one(at, best_hz)
         ]
-        best, second, *_ = sorted(each)
-        true_hz = places_hz[line][int(np.argmin(each))]
+        best, second, *_ = np.argsort(each)
+        true_hz, else_hz = places_hz[line][best], places_hz[line][second if best == 0 else 0]
         looks_slow = true_hz == line.frequency_hz.value and _looks_slow(true_hz, rate_hz, others)
-        if second - best >= _SURE and not looks_slow:
+        if each[second] - each[best] < _SURE or looks_slow:
+            continue
+        there = with_one(at, best_hz)[best]
+        also = sum(_cost(night, at_hz(there), other, {line: else_hz}) for other in others)
+        # Else two vibrations look the same at the usual rate: neither stands for both.
+        if cost(*there) - also < _SURE:
             shown[line.frequency_hz.value] = true_hz
     return shown
 
@@ -254,11 +259,27 @@ def _true_hz(line_hz: float, rate_hz: float, multiples: int = _MULTIPLES) -> lis
     ]
 
 
-def _cost(night: Night, at_hz: Mapping[LearntLine, float], opened: Opened) -> float:
-    """Negative logarithm of the likelihood of what another rate shows, with the lines at these places."""
+def _cost(
+    night: Night,
+    at_hz: Mapping[LearntLine, float],
+    opened: Opened,
+    also_hz: Mapping[LearntLine, float] | None = None,
+) -> float:
+    """Negative logarithm of the likelihood of what another rate shows, with the lines at these places.
+
+    And with some of them at other places, too.
+    """
     rate_hz = 1 / opened.period_s
-    seen_hz = {line: max(LEAST_LINE_HZ, seen_at_hz(hz, rate_hz)) for line, hz in at_hz.items()}
-    begin = guess_of(night, seen_hz)
+
+    def seen(places_hz: Mapping[LearntLine, float]) -> Guess:
+        return guess_of(
+            night,
+            {line: max(LEAST_LINE_HZ, seen_at_hz(hz, rate_hz)) for line, hz in places_hz.items()},
+        )
+
+    begin = seen(at_hz)
+    if also_hz:
+        begin = begin._replace(lines=begin.lines + seen(also_hz).lines)
     # A mirror that may move otherwise than it did explains away a line that is not where it should be.
     end = likeliest(opened, begin, free_mirror=False)
     both = zip(begin.lines, end.guess.lines, strict=True)

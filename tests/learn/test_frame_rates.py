@@ -158,6 +158,17 @@ def test_a_weak_alias_makes_no_alias_of_a_strong_slow_line(paper, fixed, seed):
     assert not any(one.is_alias for one in classified), classified
 
 
+@pytest.mark.parametrize("seed", [2, pytest.param(4, marks=pytest.mark.long)])
+def test_a_line_with_an_alias_in_its_place_is_not_called_one(paper, fixed, seed):
+    lines = (Line(3.1, 0.02, 0.025), Line(RATE_HZ + 3.1, 0.002, 0.03))
+    truth = dataclasses.replace(paper, lines=lines)
+    _, series = held(truth, fixed, TWO_MINUTES_S, seed)
+    period_s = 1 / classifying_rate([3.1], RATE_HZ)
+    _, other = held(dataclasses.replace(truth, period_s=period_s), fixed, OTHER_S, seed + 1)
+
+    assert estimated([series], paper, (), [AtOtherRate(period_s, [other])])[2] == []
+
+
 # ---------------------------------------------------------------- asking
 
 
