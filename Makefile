@@ -98,13 +98,13 @@ test-faults-all: $(READY)
 
 # As much as fits into continuous integration; with the PART_SEED that it prints, a run is repeated.
 PART_SEED := $(or $(PART_SEED),$(shell od -An -N2 -tu2 /dev/urandom | tr -d ' '))
-test-long-part: export FITCTL_TESTS_PART = 120
+test-long-part: export FITCTL_TESTS_PART = 100
 test-instrument-part: export FITCTL_TESTS_PART = 16
-test-faults-part: export FITCTL_TESTS_PART = 30
+test-faults-part: export FITCTL_TESTS_PART = 25
 %-part: export FITCTL_TESTS_SEED = $(PART_SEED)
-test-long-part: test-long  ## Run 120 of the tests of test-long, drawn at random
+test-long-part: test-long  ## Run 100 of the tests of test-long, drawn at random
 test-instrument-part: test-instrument  ## Run 16 tests of test-instrument, drawn at random, and those that must run alone
-test-faults-part: test-faults-all  ## Run 30 entries of the whole fault catalogue, drawn at random
+test-faults-part: test-faults-all  ## Run 25 entries of the whole fault catalogue, drawn at random
 
 test-faults-testbed: $(READY)  ## Run the fault catalogue's entries for the whole testbed
 	$(BIN)/pytest -m "fault and testbed" $(FAULTS) $(ARGS)
