@@ -40,6 +40,8 @@ _BROADER = 3.0
 _WEAKER = 0.4
 """of its RMS it must have: beyond that it explains something else. A narrow line has less for a seventh of the
 time, and is not classified then."""
+_HIDDEN_HZ = 0.5
+"""Below this, air looks like a line."""
 _SURE = 6.0
 """By how much the logarithm of the likelihood must be higher in one case: it is 400 times as likely."""
 
@@ -223,7 +225,8 @@ def _shown(
         best, second, *_ = np.argsort(each)
         true_hz, else_hz = places_hz[line][best], places_hz[line][second if best == 0 else 0]
         looks_slow = true_hz == line.frequency_hz.value and _looks_slow(true_hz, rate_hz, others)
-        if each[second] - each[best] < _SURE or looks_slow:
+        hidden = all(seen_at_hz(true_hz, 1 / other.period_s) < _HIDDEN_HZ for other in others)
+        if each[second] - each[best] < _SURE or looks_slow or hidden:
             continue
         there = with_one(at, best_hz)[best]
         also = sum(_cost(night, at_hz(there), other, {line: else_hz}) for other in others)
