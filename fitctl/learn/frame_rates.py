@@ -8,7 +8,7 @@ the line is at one of a few frequencies, and the likelihoods show at which, and 
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from fitctl.controllers.design.linear_loop.spectrum import seen_at_hz
 from fitctl.learn.night import LEAST_LINE_HZ, LearntLine, Night, guess_of
 from fitctl.learn.opened import Opened, Series, periodograms
-from fitctl.learn.whittle import Guess, LineGuess, likeliest
+from fitctl.learn.whittle import LineGuess, likeliest
 from fitctl.loop.frame_rate import OTHER_RATE, frames_watched
 
 Floats = NDArray[np.float64]
@@ -172,7 +172,7 @@ def _looks_otherwise(opened: Opened, night: Night, line: LearntLine, at_hz: floa
     """Whether frames at the usual rate show surely that a line is not this alias, but slow."""
     slow_hz = {one: one.frequency_hz.value for one in night.lines}
     as_slow, as_alias = (
-        likeliest(opened, guess_of(night, places)).cost
+        likeliest(opened, guess_of(night, places.items())).cost
         for places in (slow_hz, slow_hz | {line: at_hz})
     )
     return as_alias - as_slow >= _SURE
@@ -196,7 +196,7 @@ def _shown(
 
     @functools.cache
     def cost(*places: float) -> float:
-        return sum(_cost(night, at_hz(places), other) for other in others)
+        return sum(_cost(night, at_hz(places).items(), other) for other in others)
 
     def with_one(at: int, places: Sequence[float]) -> list[tuple[float, ...]]:
         """One line at each of its places, and the others where they are."""
@@ -219,7 +219,7 @@ def _shown(
     for at, line in enumerate(lines):
         # Frames at the usual rate show the tails of an alias otherwise than those of a slow line.
         each = [
-            cost(*one) + likeliest(opened, guess_of(night, at_hz(one))).cost
+            cost(*one) + likeliest(opened, guess_of(night, at_hz(one).items())).cost
             for one in with_one(at, best_hz)
         ]
         best, second, *_ = np.argsort(each)
@@ -229,9 +229,9 @@ def _shown(
         if each[second] - each[best] < _SURE or looks_slow or hidden:
             continue
         there = with_one(at, best_hz)[best]
-        also = sum(_cost(night, at_hz(there), other, {line: else_hz}) for other in others)
-        # Else two vibrations look the same at the usual rate: neither stands for both.
-        if cost(*there) - also < _SURE:
+        both = [*at_hz(there).items(), (line, else_hz)]
+        # If it is seen at both places, two vibrations look the same at the usual rate.
+        if cost(*there) - sum(_cost(night, both, other) for other in others) < _SURE:
             shown[line.frequency_hz.value] = true_hz
     return shown
 
@@ -262,27 +262,11 @@ def _true_hz(line_hz: float, rate_hz: float, multiples: int = _MULTIPLES) -> lis
     ]
 
 
-def _cost(
-    night: Night,
-    at_hz: Mapping[LearntLine, float],
-    opened: Opened,
-    also_hz: Mapping[LearntLine, float] | None = None,
-) -> float:
-    """Negative logarithm of the likelihood of what another rate shows, with the lines at these places.
-
-    And with some of them at other places, too.
-    """
+def _cost(night: Night, places_hz: Iterable[tuple[LearntLine, float]], opened: Opened) -> float:
+    """Negative logarithm of the likelihood of what another rate shows, with the lines at these places."""
     rate_hz = 1 / opened.period_s
-
-    def seen(places_hz: Mapping[LearntLine, float]) -> Guess:
-        return guess_of(
-            night,
-            {line: max(LEAST_LINE_HZ, seen_at_hz(hz, rate_hz)) for line, hz in places_hz.items()},
-        )
-
-    begin = seen(at_hz)
-    if also_hz:
-        begin = begin._replace(lines=begin.lines + seen(also_hz).lines)
+    seen_hz = [(line, max(LEAST_LINE_HZ, seen_at_hz(hz, rate_hz))) for line, hz in places_hz]
+    begin = guess_of(night, seen_hz)
     # A mirror that may move otherwise than it did explains away a line that is not where it should be.
     end = likeliest(opened, begin, free_mirror=False)
     both = zip(begin.lines, end.guess.lines, strict=True)

@@ -10,7 +10,7 @@ criterion that charges for the search over all frequencies.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -142,8 +142,8 @@ def estimate(opened: Opened, expected: AirPathModel, noise_px: float) -> Night:
     return _night(opened, found)
 
 
-def guess_of(night: Night, at_hz: Mapping[LearntLine, float]) -> Guess:
-    """The spectrum of a night, with these of its lines, each at its place."""
+def guess_of(night: Night, places_hz: Iterable[tuple[LearntLine, float]]) -> Guess:
+    """The spectrum of a night, with these of its lines, each at its place; one may be at several."""
     return Guess(
         air_of(night.air_path),
         night.noise_px.value,
@@ -151,7 +151,7 @@ def guess_of(night: Night, at_hz: Mapping[LearntLine, float]) -> Guess:
         night.overshoot.value,
         tuple(
             LineGuess(hz, line.half_width_hz.value, np.array([rms.value for rms in line.rms_px]))
-            for line, hz in at_hz.items()
+            for line, hz in places_hz
         ),
     )
 
@@ -161,7 +161,7 @@ def estimate_with_aliases(opened: Opened, night: Night, at_hz: Mapping[LearntLin
 
     Frames show their tails otherwise than those of a slow line, for which air, mirror and noise make up.
     """
-    return _night(opened, likeliest(opened, guess_of(night, at_hz)))
+    return _night(opened, likeliest(opened, guess_of(night, at_hz.items())))
 
 
 def _with_more_lines(

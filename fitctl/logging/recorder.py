@@ -26,6 +26,7 @@ from fitctl.logging.records import (
     Severity,
 )
 from fitctl.logging.rotation import RotatingLog
+from fitctl.text import UNDECODABLE
 
 STATUS_PERIOD_S = 1.0
 DRAIN_S = 2.0
@@ -187,7 +188,7 @@ class _Recording:
             if isinstance(envelope.record, RunInfo):
                 self._wall_minus_monotonic_s = envelope.record.wall_minus_monotonic_s
             self._write(envelope.record)
-        except (msgspec.DecodeError, ValueError) as error:
+        except (*UNDECODABLE, ValueError) as error:
             self._malformed += 1
             self._malformed_why = str(error)
 
@@ -213,7 +214,7 @@ def _envelope_of(data: bytes) -> Envelope:
 
     Raises
     ------
-    msgspec.DecodeError, ValueError
+    msgspec.DecodeError, RecursionError, ValueError
         If it is damaged, or of another version.
     """
     try:

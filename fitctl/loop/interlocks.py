@@ -110,6 +110,11 @@ class Interlocks:
         self._mode = ""
         self._active: list[_Rule] = []
 
+    @property
+    def holds(self) -> bool:
+        """Whether what is tripped keeps the stages from following star or beam."""
+        return self.action in {"freeze", "flatten"}
+
     def evaluate(self, mode: str, now_s: float, readings: Mapping[str, Reading]) -> list[Change]:
         """What trips and what is over, now, by the newest reading of each quantity.
 

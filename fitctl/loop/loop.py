@@ -186,7 +186,7 @@ class Loop(ABC):
         reason = next(trip.reason for trip in self.interlocks.tripped if trip.action == action)
         if action == "safe" and self.mode is not Mode.SAFE:
             self.fire(Trigger.FAULT, reason)
-        elif action in {"freeze", "flatten"} and self.mode is Mode.EXPERIMENT:
+        elif self.interlocks.holds and self.mode is Mode.EXPERIMENT:
             self.fire(Trigger.EXPERIMENT_DONE, reason)
 
     def reset_interlock(self, name: str) -> str:

@@ -178,7 +178,7 @@ class MetrologyLoop(Loop):
         duration_s = min(since_s, MOST_TICK_S)
         self._ticked_s = now_s
         law = self._laws.get(self.mode)
-        if law is not None and self.interlocks.action not in {"freeze", "flatten"}:
+        if law is not None and not self.interlocks.holds:
             law(sensed, duration_s)
         self._decided_s = self._clock.now_s()
 

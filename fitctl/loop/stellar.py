@@ -258,7 +258,7 @@ class StellarLoop(Loop):
     @property
     def _is_stopped(self) -> bool:
         """An interlock keeps the stages from following the star."""
-        return self.mode in TRACKING and self.interlocks.action in {"freeze", "flatten"}
+        return self.mode in TRACKING and self.interlocks.holds
 
     def _evaluate_learning(self, observation: Observation) -> None:
         """Go back to the design before, where the learnt one does worse."""

@@ -137,11 +137,7 @@ class CollectorWatch:
 
     def close(self) -> None:
         """Stop what moves, and disconnect; waits for that."""
-        self._stops += 1
-        if self.is_open and (
-            self.drive.running or self._busy
-        ):  # a reference move is busy, and no course
-            self._stop()
+        self.stop()
         for thread in self._threads:
             thread.join(_CLOSE_TIMEOUT_S)
         self.is_open = False

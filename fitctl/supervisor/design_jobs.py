@@ -130,10 +130,9 @@ class DesignJobs:
         if news:
             self._journal.event("info", loop.name, news)
         if loop.learning.wants_change(self._clock.now_s()):
-            if loop.name in self._learning:
-                self._learning[
-                    loop.name
-                ].cancel()  # if it has not begun: a newer report counts more
+            before = self._learning.get(loop.name)
+            if before is not None:
+                before.cancel()  # if it has not begun: a newer report counts more
             done = partial(self._learnt, loop, report)
             self._learning[loop.name] = self._make(done, loop.name, report.design_json)
             self.finish()

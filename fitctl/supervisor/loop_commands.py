@@ -73,9 +73,12 @@ def start_experiment(rig: Rig, loops: StellarLoops, command: Experiment) -> str:
         return f"experiment is not available in {loop.mode.name}; it needs COARSE or VERNIER"
     if loop.waits_for:
         return f"experiment is not available while loop {loop.name} waits for {loop.waits_for}"
-    if loop.interlocks.action in {"freeze", "flatten"}:
-        tripped = ", ".join(trip.name for trip in loop.interlocks.tripped)
-        return f"experiment is not available while an interlock keeps the stages where they are: {tripped}"
+    interlocks = loop.interlocks
+    if interlocks.holds:
+        names = ", ".join(
+            trip.name for trip in interlocks.tripped if trip.action == interlocks.action
+        )
+        return f"experiment is not available while an interlock keeps the stages where they are: {names}"
     why_not = refused_drives(rig, loop.name, command.drives)
     if why_not:
         return f"experiment: {why_not}"

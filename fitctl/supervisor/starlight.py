@@ -68,12 +68,13 @@ class Starlight:
 
     def designed(self, noise_px: float, future: Future) -> None:
         """Use the design that was made, unless the loop has another one by now."""
-        error, before, self._remade = future.exception(), self._remade, None
+        error, design, before = future.exception(), self.loop.pointing.design, self._remade
+        self._remade = None
         if error is not None:
             self._journal.event(
                 "warning", self.loop.name, f"no design for the star's light: {error_text(error)}"
             )
-        elif before is not None and self.loop.pointing.design is before:
-            was_px = float(before.parameters["noise_px"])
+        elif design is before:
+            was_px = float(design.parameters["noise_px"])
             why = f"the star's light gives {noise_px:.4f} px of noise, not {was_px:.4f}"
             self.loop.use(future.result(), why, by_itself=True)

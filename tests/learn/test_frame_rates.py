@@ -134,15 +134,19 @@ def test_an_alias_that_frames_at_the_usual_rate_disprove_is_forgotten(paper, fix
     assert estimated([series], paper, [Classified(6.0, 44.0)])[2] == []
 
 
+def classified(paper, fixed, truth, other, other_hz, seed=5):
+    """Lines that two minutes of a night and some seconds of another, at another rate, classify."""
+    _, series = held(truth, fixed, TWO_MINUTES_S, seed)
+    _, shown = held(dataclasses.replace(other, period_s=1 / other_hz), fixed, OTHER_S, seed + 1)
+    return estimated([series], paper, (), [AtOtherRate(1 / other_hz, [shown])])[2]
+
+
 @pytest.mark.parametrize("hz", [1.3, pytest.param(9.0, marks=pytest.mark.long)])
 def test_a_line_that_is_not_there_at_the_other_rate_is_not_classified(paper, fixed, hz):
     """A narrow line fades by itself."""
     truth = dataclasses.replace(paper, lines=(Line(hz, 0.0005, 0.02),))
-    _, series = held(truth, fixed, TWO_MINUTES_S, 5)
-    slower = dataclasses.replace(paper, period_s=1 / classifying_rate([hz], RATE_HZ))
-    _, without = held(slower, fixed, OTHER_S, 6)
 
-    assert estimated([series], paper, (), [AtOtherRate(slower.period_s, [without])])[2] == []
+    assert classified(paper, fixed, truth, paper, classifying_rate([hz], RATE_HZ)) == []
 
 
 @pytest.mark.parametrize("seed", [0, 2, pytest.param(4, marks=pytest.mark.long)])
@@ -150,23 +154,26 @@ def test_a_weak_alias_makes_no_alias_of_a_strong_slow_line(paper, fixed, seed):
     """At the other rate the slow line is hidden by the air."""
     lines = (Line(1.0, 0.005, 0.045), Line(RATE_HZ + 1.05, 0.001, 0.009))
     truth = dataclasses.replace(paper, lines=lines)
-    _, series = held(truth, fixed, TWO_MINUTES_S, seed)
-    period_s = 1 / classifying_rate([1.0], RATE_HZ)
-    _, other = held(dataclasses.replace(truth, period_s=period_s), fixed, OTHER_S, seed + 1)
-    classified = estimated([series], paper, (), [AtOtherRate(period_s, [other])])[2]
+    found = classified(paper, fixed, truth, truth, classifying_rate([1.0], RATE_HZ), seed)
 
-    assert not any(one.is_alias for one in classified), classified
+    assert not any(one.is_alias for one in found), found
 
 
 @pytest.mark.parametrize("seed", [2, pytest.param(4, marks=pytest.mark.long)])
 def test_a_line_with_an_alias_in_its_place_is_not_called_one(paper, fixed, seed):
     lines = (Line(3.1, 0.02, 0.025), Line(RATE_HZ + 3.1, 0.002, 0.03))
     truth = dataclasses.replace(paper, lines=lines)
-    _, series = held(truth, fixed, TWO_MINUTES_S, seed)
-    period_s = 1 / classifying_rate([3.1], RATE_HZ)
-    _, other = held(dataclasses.replace(truth, period_s=period_s), fixed, OTHER_S, seed + 1)
 
-    assert estimated([series], paper, (), [AtOtherRate(period_s, [other])])[2] == []
+    assert classified(paper, fixed, truth, truth, classifying_rate([3.1], RATE_HZ), seed) == []
+
+
+@pytest.mark.parametrize("seed", [0, pytest.param(2, marks=pytest.mark.long)])
+def test_what_would_be_seen_near_zero_is_not_classified(paper, fixed, seed):
+    """There air looks like a line; at 48.5 frames/s this alias is at 0.3 Hz, on a night of little air."""
+    air = paper.air_path.model_copy(update={"gain_px": 0.05})
+    truth = dataclasses.replace(paper, lines=(Line(48.8, 0.0005, 0.05),), air_path=air)
+
+    assert classified(paper, fixed, truth, truth, 48.5, seed) == []
 
 
 # ---------------------------------------------------------------- asking

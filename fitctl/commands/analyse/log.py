@@ -39,7 +39,6 @@ LogArgument = Annotated[
 LogsArgument = Annotated[
     list[Path] | None, typer.Argument(metavar="LOG...", help="MCAP files, finished or not.")
 ]
-
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Overwrite an existing file.")]
 TopicOption = Annotated[
     list[str] | None,
