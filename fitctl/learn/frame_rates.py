@@ -30,7 +30,7 @@ _LEAST_S = 8.0  # at another rate: lines that are worth it show within a few sec
 _MULTIPLES, _MORE_MULTIPLES = 2, 5
 SAME_LINE_HZ = 0.3
 """A line is the one that was classified before if it is no farther from it: some drift."""
-WORTH_CLASSIFYING = 0.95
+WORTH_CLASSIFYING = 0.9
 """A design that knows which lines are aliases must leave at most this part, or another rate is not worth it."""
 _ROUNDS = 3
 _STAYS_HZ = 0.2

@@ -316,9 +316,13 @@ def test_a_design_that_loses_more_while_lines_are_weak_than_it_gains_is_not_wort
     assert "while the lines are weak it leaves 0.0100 px" in refused.lines_of_text()[-1]
 
 
+@pytest.mark.parametrize("counted", [1.0, 0.76])
 @pytest.mark.parametrize(("part", "worth_it"), [(0.87, True), (0.93, False)])
-def test_a_mirror_that_moves_much_less_must_gain_more(six_hz, part, worth_it):
+def test_a_mirror_that_moves_much_less_must_gain_more(six_hz, part, worth_it, counted):
+    """Whether the design counts with that gain or not."""
     _, advice = six_hz
+    parameters = advice.design.parameters | {"mirror_gain": counted}
+    advice = advice._replace(design=dataclasses.replace(advice.design, parameters=parameters))
     less = advice.night._replace(mirror_gain=Interval(0.76, 0.71, 0.81))
     present_px, _ = advice.shown_px
     calm = advice._replace(without_lines_px=(0.01, 0.01))
