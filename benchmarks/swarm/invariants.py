@@ -17,9 +17,18 @@ from fitctl.clock import Clock
 from fitctl.config import Rig
 from fitctl.config.base import ARCSEC_PER_RAD
 from fitctl.drivers.interface import AzEl, Pose
-from fitctl.logging.records import AnyRecord, DevicesOpened, Event, ModeChange, PiezoReading, Tick
+from fitctl.logging.records import (
+    AnyRecord,
+    ControllerChange,
+    DevicesOpened,
+    Event,
+    ModeChange,
+    PiezoReading,
+    Tick,
+)
 from fitctl.messages.commands import (
     AnyCommand,
+    Experiment,
     Jog,
     Look,
     MoveCollector,
@@ -29,6 +38,7 @@ from fitctl.messages.commands import (
     Stop,
 )
 from fitctl.messages.modes import FOLLOWING, Mode, Trigger
+from fitctl.model.drives import experiment_s
 from fitctl.model.optics import motor_sky_rad_per_rad
 from fitctl.model.plant import Plant
 from fitctl.service.admission import Sender
@@ -62,6 +72,7 @@ _RESTS_S = 1.0  # beyond the time after which a drive without its master stops b
 _HARDLY = 0.02  # of the velocity limit: slower, a servo corrects what its encoder counts
 _MOVED_S = 1.0  # beyond the time that a siderostat takes from one end of its travel to the other
 _COLLECTOR_RESTS_S = 3.0
+_EXPERIMENT_ENDS_S = 1.0  # after its last motion
 
 
 class Violation(NamedTuple):
@@ -154,15 +165,18 @@ class Invariants:
         self._stepped_s = 0.0
         self._powerless, self._unneeded = _Lasting(), _Lasting()
         self._silent, self._turning, self._stopped_for = _Lasting(), _Lasting(), _Lasting()
+        self._experimenting = _Lasting()
         self._lasting = (
             self._powerless,
             self._unneeded,
             self._silent,
             self._turning,
             self._stopped_for,
+            self._experimenting,
         )
         self._ticked_s = self._stall_ended_s = 0.0
         self._jogged_s: dict[str, float] = {}
+        self._experiment_s: dict[str, float] = {}  # by loop: how long the newest takes
         self._collector_is_stopped = False
         self.nothing_fails = False
         self._stopped_s: dict[str, float] = {}  # by loop: a stop that no power-up has followed
@@ -298,6 +312,8 @@ class Invariants:
                 self._power_up_s[name] = now_s
             elif isinstance(command, Look):
                 self._pointed_at.add(name)
+            elif isinstance(command, Experiment):
+                self._experiment_s[name] = experiment_s(command.drives)
 
     def _collector_is_to_stop(self, *, is_so: bool) -> None:
         if not (is_so and self._collector_is_stopped):
@@ -323,8 +339,25 @@ class Invariants:
                 if not record.error:
                     self._opened_well(record)
                     self._opened.add(record.loop)
+            case ControllerChange():
+                self._controller_changed(record)
             case PiezoReading():
                 self._piezo_read_s[record.loop] = record.time_s
+
+    def _controller_changed(self, change: ControllerChange) -> None:
+        """Another design is in force; one with a reason was not chosen by an operator."""
+        if (
+            not change.reason
+            or self._supervisor is None
+            or '"learnt": true' not in change.design_json
+        ):
+            return
+        loop = self._supervisor.stellar_loops[change.loop]
+        if loop.mode is not Mode.VERNIER or loop.learning.setting != "on":
+            self.violated(
+                "a learnt design comes by itself only while the star is held",
+                f"{loop.name}: in {loop.mode.name}, learn = {loop.learning.setting!r}",
+            )
 
     def _opened_well(self, opened: DevicesOpened) -> None:
         name = opened.loop
@@ -545,6 +578,7 @@ class Invariants:
             self._power(name, loop.mode, busy=jobs.busy, now_s=now_s)
             self._safe_in_time(name, loop.mode, now_s)
             self._turns(name, loop.mode, now_s)
+            self._experiments(name, loop.mode, now_s)
         self._collector_rests(now_s)
 
     def _safe_in_time(self, name: str, mode: Mode, now_s: float) -> None:
@@ -570,6 +604,12 @@ class Invariants:
                         "a loop without one of its devices is SAFE in time",
                         f"{name}: in {mode.name} after {device} was {state} for {lasted_s:.2f} s ({how})",
                     )
+
+    def _experiments(self, name: str, mode: Mode, now_s: float) -> None:
+        """An experiment ends after its last motion."""
+        lasted_s = self._experimenting.lasted_s(name, is_so=mode is Mode.EXPERIMENT, now_s=now_s)
+        if lasted_s > self._experiment_s.get(name, 0.0) + _EXPERIMENT_ENDS_S:
+            self.violated("an experiment ends", f"{name}: in EXPERIMENT for {lasted_s:.2f} s")
 
     def _fault_of(self, name: str, device: str) -> str:
         """The fault that a device reports whenever it answers, if that demands SAFE."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from functools import partial
 from random import Random
@@ -12,11 +13,14 @@ from benchmarks.swarm.lines import FAULTS, WRONG, drawn_slowness
 from fitctl.messages.commands import (
     Acquire,
     AnyCommand,
+    Experiment,
     FrameRate,
     Jog,
+    LearnerReport,
     Look,
     MoveCollector,
     Off,
+    RecentEvents,
     Recover,
     Release,
     Reset,
@@ -30,6 +34,7 @@ from fitctl.messages.commands import (
     Stop,
     TakeOver,
 )
+from fitctl.model.drives import FSM, SIDEROSTAT, STACKS, Channel, Drive
 
 RIGS: dict[str, tuple[str, ...]] = {
     "fit-mock.toml": ("right",),
@@ -45,6 +50,8 @@ _SETTINGS = (
     "logging.queue_records=200",
     "supervisor.telemetry_hz=20.0",
     "loops.right.acquisition.search_again_s=10.0",
+    'interlocks.flux_low.action="freeze"',
+    'interlocks.flux_low.action="flatten"',
 )
 """Settings that some runs change."""
 _SETTING = 0.15  # fraction of runs that change each of them
@@ -83,8 +90,37 @@ _WRONG = 0.25  # fraction of strikes with wrong values, on devices that can have
 # Fraction of runs with each change of the sky, and of those that the rig file knows.
 _SKY, _TOLD = 0.15, 0.5
 PHOTON_NOISE = "camera.electrons_per_dn=1.0"
+_LEARNT = {
+    "coarse_per_s": 0.46,
+    "settings": {"minimum_variance": {"drift_px_per_sqrt_s": 0.01, "offload_per_s": 0.03}},
+}
+_AIR = {"gain_px": 0.45, "b1_s2": 0.517, "b2_s": 2.5}
+_LEARNT_DESIGNS = [
+    json.dumps({"name": "minimum-variance", "parameters": _LEARNT | night})
+    for night in (
+        {"noise_px": 0.03, "air_path": _AIR},
+        {
+            "noise_px": 0.01,
+            "air_path": _AIR,
+            "lines": [{"frequency_hz": 6.0, "damping": 0.005, "rms_px": 0.05}],
+            "guard": {"frequency_hz": 19.4, "damping": 0.9, "rms_px": 0.0094},
+        },
+        {"noise_px": 0.001, "air_path": _AIR | {"gain_px": 5.0}},
+    )
+]
+"""For a noisy star and for a line at 6 Hz; the last has not the margins, and must be refused."""
 _AT_ONCE_S = 0.004  # mean delay between hurried commands
 _LONG_STALL, _SILENT = 0.3, 0.5  # fractions of disturbed rests
+_LEARNER, _LEARNS = 0.4, 0.5  # fraction of runs with a learner, and of these, with `learn = "on"`
+_REPORTS_S = 5.0  # mean time between a learner's reports
+_NOTHING_LEARNT, _WORTH_IT = 0.2, 0.7  # fractions of its reports
+# Most amplitude of an experiment's motions. Those of stacks and siderostats may be beyond their range.
+_SWINGS: tuple[tuple[tuple[Channel, ...], float], ...] = (
+    (STACKS, 5.5),
+    (FSM, 1.0),
+    (SIDEROSTAT, 60.0),
+)
+_EXPERIMENTS = 0.4  # fraction of runs with faults in which experiments are met by something
 _COLLECTOR = 0.4  # fraction of the testbed's runs in which its collector is moved on purpose
 _REFERENCED_S = 7.0  # until a reference move has ended
 _BURST, _BURST_S = 0.4, 0.05  # fraction of happenings that follow another at once, and mean delay
@@ -224,6 +260,63 @@ def drawn_target(random: Random) -> SetTarget:
     return SetTarget(az_px=random.uniform(10, 30), el_px=random.uniform(10, 30))
 
 
+def drawn_experiment(random: Random) -> Experiment:
+    """One to three motions of mirror or siderostat, of up to 10 s; some are beyond what a rig accepts."""
+    return Experiment(
+        name="swarm", drives=[_drawn_drive(random) for _ in range(random.randint(1, 3))]
+    )
+
+
+def _drawn_drive(random: Random) -> Drive:
+    channels, most = random.choice(_SWINGS)
+    return Drive(
+        channel=random.choice(channels),
+        shape=random.choice(("triangle", "sine", "square")),
+        amplitude=random.uniform(0.0, most),
+        frequency_hz=10 ** random.uniform(-1.0, 1.5),
+        duration_s=10 ** random.uniform(-1.0, 1.0),
+        start_s=random.choice((0.0, random.uniform(0.0, 2.0))),
+        end_amplitude=random.choice((None, random.uniform(0.0, most))),
+        end_frequency_hz=random.choice((None, random.uniform(0.1, 30.0))),
+    )
+
+
+def drawn_report(random: Random, loop: str) -> LearnerReport:
+    """A learner's report on a loop, right or wrong; in some, nothing is learnt."""
+    if random.random() < _NOTHING_LEARNT:
+        return LearnerReport(loop=loop, design_json="", text="nothing is learnt", evaluated_s=60.0)
+    present_px, measured_px = random.uniform(0.01, 0.05), random.uniform(0.01, 0.05)
+    return LearnerReport(
+        loop=loop,
+        design_json=random.choice(_LEARNT_DESIGNS),
+        text="a night of the swarm",
+        evaluated_s=random.uniform(60.0, 600.0),
+        present_px=present_px,
+        learnt_px=present_px * random.uniform(0.5, 0.99),
+        bound_px=0.5 * present_px,
+        learnt_camera_px=measured_px * random.uniform(0.5, 1.5),
+        measured_px=measured_px,
+        noise_px=random.uniform(0.003, 0.03),
+        worth_it=random.random() < _WORTH_IT,
+        fits=random.random() < _WORTH_IT,
+        classifying_rate_hz=random.choice((0.0, 47.0, 470.0)),
+    )
+
+
+_MEETS_EXPERIMENT = (
+    "stop",
+    "off",
+    "release",
+    "acquire",
+    "target",
+    "look",
+    "controller",
+    "frame-rate",
+    "experiment",
+    "shutdown",
+)
+"""Commands that come while an experiment is under way; see `_COMMANDS`."""
+
 _COMMANDS: dict[str, Callable[[Random], AnyCommand | None]] = {
     "onwards": lambda _: None,
     "stop": lambda _: Stop(),
@@ -238,7 +331,9 @@ _COMMANDS: dict[str, Callable[[Random], AnyCommand | None]] = {
     "jog": lambda random: Jog(
         az_sky_arcsec=random.uniform(-60, 60), el_sky_arcsec=random.uniform(-60, 60)
     ),
-    "controller": lambda random: SetController(name=random.choice(("eq20", "minimum-variance"))),
+    "controller": lambda random: SetController(
+        name=random.choice(("eq20", "minimum-variance", "learnt"))
+    ),
     "sequence-control": lambda random: SequenceControl(
         action=random.choice(("pause", "resume", "end"))
     ),
@@ -251,6 +346,8 @@ _COMMANDS: dict[str, Callable[[Random], AnyCommand | None]] = {
     "bias-offset": lambda random: SetBiasOffset(
         az_urad=random.uniform(-100, 100), el_urad=random.uniform(-100, 100)
     ),
+    "experiment": drawn_experiment,
+    "events": lambda _: RecentEvents(),
     "frame-rate": lambda random: FrameRate(
         rate_hz=random.choice((47.0, 48.0, 470.0, 480.0)),
         duration_s=random.uniform(1.0, MOST_RATE_S),
@@ -280,6 +377,11 @@ def several_writes(rig: str) -> list[str]:
         for loop in stars_of(rig)
         for key in ("fsm.dac.writes_per_frame=5", "vernier.controller=minimum-variance")
     ]
+
+
+def learning(rig: str) -> list[str]:
+    """Settings with which a rig's loops use learnt designs by themselves."""
+    return [f'loops.{loop}.learn="on"' for loop in stars_of(rig)]
 
 
 def vibrating(rig: str, frequency_hz: float, rms_px: float, direction_deg: float) -> list[str]:
@@ -363,30 +465,11 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
     Each run draws a few kinds of faults and commands, leaves out the others, and has its own pace. A defect
     that many faults at once would hide shows in a run that has few of them.
     """
-    loops, devices = RIGS[rig], devices_of(rig)
+    loops = RIGS[rig]
     fast = random.random() < _FAST.get(rig, 0.0)
     duration_s = FAST_DURATION_S if fast else DURATION_S
-    kinds = ("reset", "power cut", *FAULTS)
-    faults = random.sample(kinds, random.randint(1, len(kinds)))
-    struck = random.sample(devices, random.randint(1, len(devices)))
     words = random.sample(list(_COMMANDS), random.randint(1, len(_COMMANDS)))
-    strikes: list[Callable[[Random, float], list[Happening]]] = []
-    for make, part in (
-        (_stall, 0.4),
-        (_kill, 0.3),
-        (_cloud, 0.3),
-        (_recorder_death, 0.2),
-        (_full_disk, 0.2),
-        (_clock_step, 0.2),
-        (_sequence, 0.3),
-    ):
-        strikes += [make] * (random.random() < part)
-    if random.random() >= _WITHOUT_FAULTS:
-        strikes += [partial(_strike, devices=struck, faults=faults)] * random.randint(1, 6)
-        strikes += [partial(_interrupted_slew, loops=loops)] * random.randint(0, 4)
-        strikes += [partial(_disturbed_rest, loops=loops)] * random.randint(0, 2)
-    if "metrology" in loops and random.random() < _COLLECTOR:
-        strikes += [partial(_moved_collector, loops=loops)] * random.randint(1, 2)
+    strikes = _drawn_strikes(random, rig)
     every_s, fault_part = 10 ** random.uniform(-0.3, 1.0), random.uniform(0.05, 0.6)
     # The service refuses commands from operators without the lease.
     people = OPERATORS[: random.randint(1, len(OPERATORS))]
@@ -414,18 +497,65 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
             while command is not None and random.random() < repeated:
                 again_s += random.expovariate(1 / _REPEATED_S)
                 happenings.append(Order(at_s=again_s, who=who, command=command))
+    settings = _drawn_settings(random, rig, fast=fast)
+    if random.random() < _LEARNER:
+        happenings += _learner(random, duration_s, stars_of(rig))
+        settings += learning(rig) if random.random() < _LEARNS else []
     happenings.sort(key=lambda happening: happening.at_s)
     console_loss = random.random() ** 2 if random.random() < _CONSOLE_SLOW else 0.0
     remote_consoles = random.randint(1, 3) if random.random() < _REMOTE else 0
     return Plan(
         seed=seed,
         rig=rig,
-        settings=_drawn_settings(random, rig, fast=fast),
+        settings=settings,
         duration_s=duration_s,
         happenings=happenings,
         console_loss=console_loss,
         remote_consoles=remote_consoles,
     )
+
+
+def _drawn_strikes(random: Random, rig: str) -> list[Callable[[Random, float], list[Happening]]]:
+    """What happens in a run besides single commands.
+
+    Each makes the happenings that begin at a time. One that is there twice comes twice as often.
+    """
+    loops, devices = RIGS[rig], devices_of(rig)
+    kinds = ("reset", "power cut", *FAULTS)
+    faults = random.sample(kinds, random.randint(1, len(kinds)))
+    struck = random.sample(devices, random.randint(1, len(devices)))
+    strikes: list[Callable[[Random, float], list[Happening]]] = []
+    for make, part in (
+        (_stall, 0.4),
+        (_kill, 0.3),
+        (_cloud, 0.3),
+        (_recorder_death, 0.2),
+        (_full_disk, 0.2),
+        (_clock_step, 0.2),
+        (_sequence, 0.3),
+    ):
+        strikes += [make] * (random.random() < part)
+    if random.random() >= _WITHOUT_FAULTS:
+        strikes += [partial(_strike, devices=struck, faults=faults)] * random.randint(1, 6)
+        strikes += [partial(_interrupted_slew, loops=loops)] * random.randint(0, 4)
+        strikes += [partial(_disturbed_rest, loops=loops)] * random.randint(0, 2)
+        if random.random() < _EXPERIMENTS:
+            met = partial(_met_experiment, loops=stars_of(rig), devices=struck, faults=faults)
+            strikes += [met] * random.randint(1, 3)
+    if "metrology" in loops and random.random() < _COLLECTOR:
+        strikes += [partial(_moved_collector, loops=loops)] * random.randint(1, 2)
+    return strikes
+
+
+def _learner(random: Random, duration_s: float, loops: list[str]) -> list[Happening]:
+    """The learner's reports. It runs as its operator, on this machine."""
+    reports: list[Happening] = []
+    at_s = random.expovariate(1 / _REPORTS_S)
+    while at_s < duration_s:
+        report = drawn_report(random, random.choice(loops))
+        reports.append(Order(at_s=at_s, who=OPERATORS[0], command=report))
+        at_s += random.expovariate(1 / _REPORTS_S)
+    return reports
 
 
 def _drawn_settings(random: Random, rig: str, *, fast: bool) -> list[str]:
@@ -515,6 +645,28 @@ def _disturbed_rest(random: Random, at_s: float, loops: tuple[str, ...]) -> list
         if command is not None
     ]
     return [*orders, *others]
+
+
+def _met_experiment(
+    random: Random, at_s: float, loops: list[str], devices: list[str], faults: list[str]
+) -> list[Happening]:
+    """An experiment with one loop, and what comes meanwhile: a command, a fault or a stall."""
+    loop, who = random.choice(loops), OPERATORS[0]
+    experiment = msgspec.structs.replace(drawn_experiment(random), loop=loop)
+    meets_s = at_s + 10 ** random.uniform(-2.0, 1.0)
+    what = random.choice((*_MEETS_EXPERIMENT, "fault", "stall"))
+    if what == "fault":
+        meets = _strike(random, meets_s, devices, faults)
+    elif what == "stall":
+        meets = _stall(random, meets_s)
+    else:
+        command = _drawn_command(random, what, [], (loop,))
+        meets = [Order(at_s=meets_s, who=who, command=command)]
+    return [
+        Order(at_s=at_s - 0.1, who=who, command=TakeOver()),
+        Order(at_s=at_s, who=who, command=experiment),
+        *meets,
+    ]
 
 
 def _moved_collector(random: Random, at_s: float, loops: tuple[str, ...]) -> list[Happening]:

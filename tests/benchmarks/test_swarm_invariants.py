@@ -3,21 +3,25 @@
 from random import Random
 from types import SimpleNamespace
 
+import msgspec
 import pytest
 
 from benchmarks.swarm.devices.hexapod import SwarmHexapod
 from benchmarks.swarm.invariants import Invariants
 from benchmarks.swarm.lines import FAULTS, WRONG, Line
 from benchmarks.swarm.past import put_back
-from benchmarks.swarm.plan import Order, Plan, Strike, devices_of
+from benchmarks.swarm.plan import _LEARNT_DESIGNS, Order, Plan, Strike, devices_of, drawn_report
 from benchmarks.swarm.run import RIGS as FOLDER
 from benchmarks.swarm.run import run_plan
 from benchmarks.swarm.threads import VirtualTime
 from fitctl.config import load_rig
 from fitctl.drivers.interface import Pose
 from fitctl.logging.records import ModeChange
-from fitctl.messages.commands import Jog, MoveCollector, Release, Reply, Standby, Stop
+from fitctl.loop.learning import Learning
+from fitctl.loop.stellar import StellarLoop
+from fitctl.messages.commands import Experiment, Jog, MoveCollector, Release, Reply, Standby, Stop
 from fitctl.messages.modes import Mode
+from fitctl.model.drives import standstill
 from fitctl.model.plant import Plant
 from fitctl.stages.collector import CollectorDrive
 from fitctl.supervisor.piezo import PiezoWatch
@@ -371,6 +375,40 @@ def test_a_collector_that_goes_on_when_a_loop_loses_its_camera_is_found():
     assert run(*happenings, rig=TESTBED, duration_s=20.0) == set()
     with put_back("collector-in-safe"):
         assert "a stop stops the collector" in run(*happenings, rig=TESTBED, duration_s=20.0)
+
+
+@pytest.mark.long
+def test_an_experiment_that_does_not_end_is_found(monkeypatch):
+    happenings = (
+        Order(at_s=0.1, who="ada", command=None),
+        Order(at_s=1.0, who="ada", command=None),
+        Order(at_s=9.0, who="ada", command=Experiment(name="rest", drives=standstill(2.0))),
+    )
+    assert run(*happenings, duration_s=14.0) == set()
+    monkeypatch.setattr(StellarLoop, "_run_experiment", lambda *_: None)
+
+    assert run(*happenings, duration_s=14.0) == {"an experiment ends"}
+
+
+@pytest.mark.long
+def test_a_learnt_design_that_comes_by_itself_at_rest_is_found(monkeypatch):
+    report = msgspec.structs.replace(
+        drawn_report(Random(1), "right"),
+        design_json=_LEARNT_DESIGNS[0],
+        present_px=0.02,
+        learnt_px=0.01,
+        worth_it=True,
+    )
+    happenings = (
+        Order(at_s=0.1, who="ada", command=Standby()),
+        Order(at_s=2.0, who="ada", command=report),
+    )
+    assert run(*happenings, duration_s=25.0) == set()
+    monkeypatch.setattr(Learning, "wants_change", lambda *_: True)
+
+    assert run(*happenings, duration_s=25.0) == {
+        "a learnt design comes by itself only while the star is held"
+    }
 
 
 @pytest.mark.long

@@ -1,7 +1,6 @@
 """What the swarm has beside the supervisor: recorder, service, console, sequences, and their invariants."""
 
 from random import Random
-from typing import get_args
 
 import msgspec
 import numpy as np
@@ -10,16 +9,14 @@ import pytest
 from benchmarks.swarm.clients import STEPS
 from benchmarks.swarm.devices.amplifiers import SwarmAmplifiers
 from benchmarks.swarm.invariants import Invariants
-from benchmarks.swarm.lines import FAULTS, WRONG, Line
+from benchmarks.swarm.lines import Line
 from benchmarks.swarm.past import put_back
 from benchmarks.swarm.plan import (
-    _SETTINGS,
+    _LEARNT_DESIGNS,
     _SLOW,
-    PHOTON_NOISE,
     RIGS,
     Cloud,
     FullDisk,
-    Happening,
     Kill,
     Order,
     Plan,
@@ -27,14 +24,9 @@ from benchmarks.swarm.plan import (
     Sequence,
     Stall,
     Strike,
-    devices_of,
-    drawn_plan,
-    kind_of,
-    moving,
-    several_writes,
+    drawn_report,
+    learning,
     slow_servos,
-    vibrating,
-    with_another_spot,
 )
 from benchmarks.swarm.recorder import ZMQ, SwarmRecorder
 from benchmarks.swarm.run import RIGS as FOLDER
@@ -43,7 +35,7 @@ from benchmarks.swarm.service import SENDERS
 from benchmarks.swarm.telemetry_wire import RemoteConsole
 from fitctl.config import load_rig
 from fitctl.logging.queue import RecordQueue
-from fitctl.logging.records import Event, RecorderStatus
+from fitctl.logging.records import ControllerChange, Event, RecorderStatus
 from fitctl.messages import client
 from fitctl.messages.commands import (
     Acquire,
@@ -67,8 +59,6 @@ from fitctl.service.admission import Admission
 from fitctl.stages.servo import SiderostatServo
 from fitctl.tui.state import ConsoleState
 from tests.samples.log_samples import tick
-
-KINDS = {kind_of(device) for device in devices_of("fit-testbed.toml")}
 
 
 def plan(*happenings, duration_s=8.0, rig="fit-mock.toml", settings=()):
@@ -252,68 +242,28 @@ def test_each_rig_holds_its_stars_where_nothing_happens(rig, settings):
     assert result.modes["VERNIER"] >= 1
 
 
-@pytest.mark.parametrize("rig", RIGS)
-def test_every_setting_is_one_that_the_rig_can_have(rig):
-    load_rig(FOLDER / rig, list(_SETTINGS))
-    for which in range(2) if rig in _SLOW else ():
-        load_rig(FOLDER / rig, [*_SETTINGS, *slow_servos(rig, which)])
-    for told in (False, True):
-        skies = [
-            *vibrating(rig, 20.0, 0.3, 180.0),
-            *moving(rig, 0.3, -0.3, told=told),
-            *with_another_spot(rig, told=told),
-        ]
-        load_rig(FOLDER / rig, [*_SETTINGS, *several_writes(rig), PHOTON_NOISE, *skies])
-
-
-def test_a_setting_of_the_sky_is_true_of_each_star_and_known_if_it_is_told():
-    rig = "two-stars.toml"
-    loaded = [load_rig(FOLDER / rig, moving(rig, 0.2, -0.1, told=told)) for told in (False, True)]
-
-    for each in loaded:
-        rates = [star.star_rate_sky_arcsec_s for star in each.plant.stellar_loops.values()]
-        assert [(rate.az, rate.el) for rate in rates] == [(0.2, -0.1)] * 2
-    known = [
-        [loop.star_rate_sky_arcsec_s for loop in each.stellar_loops.values()] for each in loaded
-    ]
-    assert known[0] == [None, None]
-    assert [(rate.az, rate.el) for rate in known[1]] == [(0.2, -0.1)] * 2
-
-
-def test_plans_have_every_kind_of_happening():
-    happenings = [
-        happening
-        for seed in range(250)
-        for happening in drawn_plan(Random(seed), seed, "fit-testbed.toml").happenings
-    ]
-
-    assert {type(happening) for happening in happenings} == set(get_args(Happening))
-    of_lines = {(device, fault) for device in KINDS for fault in (*FAULTS, "reset")}
-    wrong = {(device, fault) for device, faults in WRONG.items() for fault in faults}
-    struck = {
-        (kind_of(happening.device), happening.fault)
-        for happening in happenings
-        if isinstance(happening, Strike)
-    }
-    assert struck == of_lines | wrong | {("siderostat", "power cut")}
-
-
-def test_plans_have_every_sky():
-    settings = " ".join(
-        text
-        for seed in range(100)
-        for text in drawn_plan(Random(seed), seed, "fit-mock.toml").settings
+def test_a_learnt_design_comes_by_itself_while_the_star_is_held():
+    report = drawn_report(Random(1), "right")
+    report = msgspec.structs.replace(
+        report, design_json=_LEARNT_DESIGNS[0], present_px=0.02, learnt_px=0.015, worth_it=True
     )
+    learner = [gives(float(at_s), report) for at_s in range(2, 40, 4)]
+    changes = []
 
-    for key in (
-        "camera.electrons_per_dn",
-        "plant.loops.right.lines",
-        "plant.loops.right.star_rate_sky_arcsec_s",
-        " loops.right.star_rate_sky_arcsec_s",
-        "plant.loops.right.spots",
-        " loops.right.other_spots",
-    ):
-        assert key in f" {settings}"
+    def keep(record):
+        if isinstance(record, ControllerChange):
+            changes.append(record)
+
+    watched = plan(
+        gives(0.1, None),
+        gives(1.0, None),
+        *learner,
+        duration_s=42.0,
+        settings=learning("fit-mock.toml"),
+    )
+    assert run_plan(watched, keep).violations == []
+    assert [change.target for change in changes][:1] == ["learnt"]
+    assert "learnt from" in changes[0].reason
 
 
 @pytest.mark.long

@@ -1,0 +1,121 @@
+"""What the draw of a plan has: rigs, settings, happenings."""
+
+from random import Random
+from typing import get_args
+
+import pytest
+
+from benchmarks.swarm.lines import FAULTS, WRONG
+from benchmarks.swarm.plan import (
+    _LEARNT_DESIGNS,
+    _SETTINGS,
+    _SLOW,
+    PHOTON_NOISE,
+    RIGS,
+    Happening,
+    Order,
+    Strike,
+    devices_of,
+    drawn_plan,
+    kind_of,
+    learning,
+    moving,
+    several_writes,
+    slow_servos,
+    vibrating,
+    with_another_spot,
+)
+from benchmarks.swarm.run import RIGS as FOLDER
+from fitctl.config import ConfigError, load_rig
+from fitctl.controllers.design.choose import design_for
+from fitctl.messages.commands import AnyCommand, RecorderReport, SequenceReport
+
+KINDS = {kind_of(device) for device in devices_of("fit-testbed.toml")}
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_every_setting_is_one_that_the_rig_can_have(rig):
+    load_rig(FOLDER / rig, list(_SETTINGS))
+    for which in range(2) if rig in _SLOW else ():
+        load_rig(FOLDER / rig, [*_SETTINGS, *slow_servos(rig, which)])
+    for told in (False, True):
+        skies = [
+            *vibrating(rig, 20.0, 0.3, 180.0),
+            *moving(rig, 0.3, -0.3, told=told),
+            *with_another_spot(rig, told=told),
+        ]
+        settings = [*_SETTINGS, *several_writes(rig), *learning(rig), PHOTON_NOISE, *skies]
+        load_rig(FOLDER / rig, settings)
+
+
+def test_a_setting_of_the_sky_is_true_of_each_star_and_known_if_it_is_told():
+    rig = "two-stars.toml"
+    loaded = [load_rig(FOLDER / rig, moving(rig, 0.2, -0.1, told=told)) for told in (False, True)]
+
+    for each in loaded:
+        rates = [star.star_rate_sky_arcsec_s for star in each.plant.stellar_loops.values()]
+        assert [(rate.az, rate.el) for rate in rates] == [(0.2, -0.1)] * 2
+    known = [
+        [loop.star_rate_sky_arcsec_s for loop in each.stellar_loops.values()] for each in loaded
+    ]
+    assert known[0] == [None, None]
+    assert [(rate.az, rate.el) for rate in known[1]] == [(0.2, -0.1)] * 2
+
+
+def test_plans_have_every_kind_of_happening():
+    happenings = [
+        happening
+        for seed in range(250)
+        for happening in drawn_plan(Random(seed), seed, "fit-testbed.toml").happenings
+    ]
+
+    assert {type(happening) for happening in happenings} == set(get_args(Happening))
+    of_lines = {(device, fault) for device in KINDS for fault in (*FAULTS, "reset")}
+    wrong = {(device, fault) for device, faults in WRONG.items() for fault in faults}
+    struck = {
+        (kind_of(happening.device), happening.fault)
+        for happening in happenings
+        if isinstance(happening, Strike)
+    }
+    assert struck == of_lines | wrong | {("siderostat", "power cut")}
+
+
+def test_plans_have_every_command_that_people_and_the_learner_give():
+    commands = {
+        type(happening.command)
+        for seed in range(100)
+        for happening in drawn_plan(Random(seed), seed, "fit-testbed.toml").happenings
+        if isinstance(happening, Order) and happening.command is not None
+    }
+
+    # The recorder and running sequences send their reports themselves.
+    assert commands == set(get_args(AnyCommand)) - {RecorderReport, SequenceReport}
+
+
+@pytest.mark.long
+def test_of_the_learnt_designs_the_last_has_not_the_margins():
+    rig = load_rig(FOLDER / "fit-mock.toml")
+    *made, refused = _LEARNT_DESIGNS
+
+    assert all(design_for(rig, "right", text).learnt for text in made)
+    with pytest.raises(ConfigError, match="margins"):
+        design_for(rig, "right", refused)
+
+
+def test_plans_have_every_sky_and_learners():
+    settings = " ".join(
+        text
+        for seed in range(100)
+        for text in drawn_plan(Random(seed), seed, "fit-mock.toml").settings
+    )
+
+    for key in (
+        "camera.electrons_per_dn",
+        "plant.loops.right.lines",
+        "plant.loops.right.star_rate_sky_arcsec_s",
+        " loops.right.star_rate_sky_arcsec_s",
+        "plant.loops.right.spots",
+        " loops.right.other_spots",
+        ' loops.right.learn="on"',
+    ):
+        assert key in f" {settings}"
