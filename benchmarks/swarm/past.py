@@ -11,16 +11,20 @@ from contextlib import ExitStack, contextmanager
 from typing import Any, NamedTuple
 from unittest.mock import patch
 
+from fitctl.config import Rig
 from fitctl.controllers.position_servo import PositionServo
 from fitctl.drivers.interface import AzEl, Frame, ServoReading
 from fitctl.loop.loop import Loop
+from fitctl.loop.observation import Observation
 from fitctl.loop.stellar import StellarLoop
-from fitctl.messages.commands import AnyCommand, Reply
+from fitctl.messages.commands import AnyCommand, Experiment, Reply
 from fitctl.messages.modes import Mode, Trigger
 from fitctl.stages.mirror import MirrorStage
 from fitctl.stages.servo import SiderostatServo
+from fitctl.supervisor import supervisor
 from fitctl.supervisor.camera_watch import CameraWatch
 from fitctl.supervisor.device_jobs import DeviceJobs
+from fitctl.supervisor.loop_commands import obey_loop_command
 from fitctl.supervisor.piezo import PiezoWatch
 from fitctl.supervisor.supervisor import Posted, Supervisor
 
@@ -33,13 +37,13 @@ class Defect(NamedTuple):
     commit : str
         That mended it.
     what : str
-    patches : sequence of (type, str, Any)
-        Class, attribute, and what it was.
+    patches : sequence of (object, str, Any)
+        Class or module, attribute, and what it was.
     """
 
     commit: str
     what: str
-    patches: Sequence[tuple[type, str, Any]]
+    patches: Sequence[tuple[object, str, Any]]
 
 
 def _post_waits(
@@ -162,11 +166,26 @@ def _without_collector(self: Supervisor, loop: Loop, *, was_safe: bool) -> None:
         _MAKE_SAFER(self, loop, was_safe=True)
 
 
+def _experiment_though_it_waits(rig: Rig, loops: Sequence[Loop], command: AnyCommand) -> str:
+    with ExitStack() as stack:
+        for loop in loops if isinstance(command, Experiment) else ():
+            stack.enter_context(patch.object(loop, "waits_for", "", create=True))
+        return obey_loop_command(rig, loops, command)
+
+
+def _experiments_on(self: StellarLoop, observation: Observation) -> None:
+    if self.waits_for and self.mode is Mode.EXPERIMENT:
+        self.waits_for = self._why_wait(observation.now_s, observation.motor_rad)
+    else:
+        _EVALUATE_WAITING(self, observation)
+
+
 def _find_nothing(self: MirrorStage) -> None:
     self._known_s = self._clock.now_s()
 
 
 _ASK = PiezoWatch.ask
+_EVALUATE_WAITING = StellarLoop._evaluate_waiting
 _SERVO_INIT = SiderostatServo.__init__
 _FIND_POSITION = SiderostatServo._find_position
 _SERVO_BY = SiderostatServo._servo_by
@@ -285,6 +304,14 @@ DEFECTS = {
         "fbf2d6c",
         "the collector goes on when a loop goes to SAFE",
         [(Supervisor, "_make_safer", _without_collector)],
+    ),
+    "experiment-waits": Defect(
+        "746ffba",
+        "an experiment begins with a loop that waits for its link, and does not end",
+        [
+            (supervisor, "obey_loop_command", _experiment_though_it_waits),
+            (StellarLoop, "_evaluate_waiting", _experiments_on),
+        ],
     ),
     "jog-in-off": Defect(
         "ac43419",

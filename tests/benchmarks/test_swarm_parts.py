@@ -39,6 +39,7 @@ from fitctl.logging.records import ControllerChange, Event, RecorderStatus
 from fitctl.messages import client
 from fitctl.messages.commands import (
     Acquire,
+    Experiment,
     Jog,
     Look,
     Off,
@@ -54,6 +55,7 @@ from fitctl.messages.commands import (
     TakeOver,
 )
 from fitctl.messages.modes import Mode
+from fitctl.model.drives import standstill
 from fitctl.model.plant import Plant
 from fitctl.service.admission import Admission
 from fitctl.stages.servo import SiderostatServo
@@ -534,6 +536,16 @@ FOUND = {
             settings=slow_servos("two-stars.toml", 1),
         ),
         "healed, every star is held within 60 s",
+    ),
+    "experiment-waits": (
+        plan(
+            *[gives(2.0 * number, None) for number in range(6)],
+            Strike(at_s=24.0, device="metrology photodiodes", fault="mute", lasts_s=4.0),
+            gives(26.0, Experiment(loop="left", name="rest", drives=standstill(0.5))),
+            duration_s=30.0,
+            rig="fit-testbed.toml",
+        ),
+        "an experiment ends",
     ),
     "jog-in-off": (
         plan(
