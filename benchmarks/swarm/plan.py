@@ -2,84 +2,39 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from functools import partial
 from random import Random
 
 import msgspec
 
+from benchmarks.swarm.commands import (
+    COMMANDS,
+    drawn_experiment,
+    drawn_report,
+    drawn_target,
+    far_search,
+)
 from benchmarks.swarm.lines import FAULTS, WRONG, drawn_slowness
+from benchmarks.swarm.rigs import FAST, RIGS, devices_of, drawn_settings, learning, stars_of
 from fitctl.messages.commands import (
-    Acquire,
     AnyCommand,
-    Experiment,
-    FrameRate,
-    Jog,
-    LearnerReport,
-    Look,
     MoveCollector,
     Off,
-    RecentEvents,
-    Recover,
     Release,
-    Reset,
-    SequenceControl,
-    SetBiasOffset,
-    SetController,
     SetTarget,
-    Shutdown,
-    Standby,
-    Status,
     Stop,
     TakeOver,
 )
-from fitctl.model.drives import FSM, SIDEROSTAT, STACKS, Channel, Drive
 
-RIGS: dict[str, tuple[str, ...]] = {
-    "fit-mock.toml": ("right",),
-    "fit-testbed.toml": ("right", "metrology", "left"),
-    "two-stars.toml": ("right", "left"),
-    "ensemble.toml": ("right",),
-    "fit-bal-analog.toml": ("right",),
-}
-"""Files in ``rigs/``, each with its loops."""
-_RIG_WEIGHTS = (8, 3, 2, 3, 3)
-_SETTINGS = (
-    "service.lease_s=10.0",
-    "logging.queue_records=200",
-    "supervisor.telemetry_hz=20.0",
-    "loops.right.acquisition.search_again_s=10.0",
-    'interlocks.flux_low.action="freeze"',
-    'interlocks.flux_low.action="flatten"',
-)
-"""Settings that some runs change."""
-_SETTING = 0.15  # fraction of runs that change each of them
-_SLOW_SERVO = {
-    "servo.rate_hz": (100.0, 50.0),
-    "servo.gain_per_s": (40.0, 15.0),
-    "servo.following_error_limit_rad": (4.0, 10.0),
-}
-"""Settings of a siderostat whose servo runs at 100 or at 50 Hz instead of 500."""
-_SLOW = {"fit-mock.toml": 0.15, "two-stars.toml": 0.5, "fit-testbed.toml": 0.6}
-"""Fraction of runs with slow servos. These runs also take less time."""
-_FAST_FRAMES = (
-    "camera.frame_rate_hz=500.0",
-    "camera.exposure_s=0.001",
-    "camera.frame_delay_s=0.0035",
-)
-_FAST = {"fit-mock.toml": 0.1}
-"""Fraction of runs with ten times as many frames; they last a third as long."""
 DURATION_S, FAST_DURATION_S = 120.0, 40.0
-MOST_RATE_S = 30.0  # of the camera at another rate
+_RIG_WEIGHTS = (8, 3, 2, 3, 3)
 OPERATORS = ("ada", "ben", "cleo", "dora")
 _OF_ONE_LOOP = 0.3  # fraction of commands that name a loop
 _WITHOUT_FAULTS = 0.15  # fraction of runs without device faults
 _CONSOLE_SLOW = 0.2  # fraction of runs whose console misses messages
-_SEVERAL_WRITES = 0.15  # fraction of runs whose mirrors are written between frames
 _REMOTE = 0.1  # fraction of runs with remote consoles: decoding takes a fifth of their time
 _STEPS = ("standby", "acquire", "acquire", "hold", "wait", "dither", "offset", "off")
-_FAR, _FAR_ARCSEC = 0.4, 550.0  # fraction of searches elsewhere, and how far at most on each axis
 # Fraction of commands that are repeated, drawn for each run, and the mean delay: a key held down.
 _REPEATED, _REPEATED_S = (0.0, 0.1, 0.6), 0.02
 _PLACES, _FEW_PLACES = 3, 0.5  # fraction of runs whose targets are only so many places
@@ -87,39 +42,10 @@ _SLOW_SLEW = 0.4  # fraction of interrupted slews on a slow line
 _SLEW_S = 1.5  # a slew is interrupted within this time of its beginning,
 _MEETS_S = 0.1  # and a stall follows within this
 _WRONG = 0.25  # fraction of strikes with wrong values, on devices that can have some
-# Fraction of runs with each change of the sky, and of those that the rig file knows.
-_SKY, _TOLD = 0.15, 0.5
-PHOTON_NOISE = "camera.electrons_per_dn=1.0"
-_LEARNT = {
-    "coarse_per_s": 0.46,
-    "settings": {"minimum_variance": {"drift_px_per_sqrt_s": 0.01, "offload_per_s": 0.03}},
-}
-_AIR = {"gain_px": 0.45, "b1_s2": 0.517, "b2_s": 2.5}
-_LEARNT_DESIGNS = [
-    json.dumps({"name": "minimum-variance", "parameters": _LEARNT | night})
-    for night in (
-        {"noise_px": 0.03, "air_path": _AIR},
-        {
-            "noise_px": 0.01,
-            "air_path": _AIR,
-            "lines": [{"frequency_hz": 6.0, "damping": 0.005, "rms_px": 0.05}],
-            "guard": {"frequency_hz": 19.4, "damping": 0.9, "rms_px": 0.0094},
-        },
-        {"noise_px": 0.001, "air_path": _AIR | {"gain_px": 5.0}},
-    )
-]
-"""For a noisy star and for a line at 6 Hz; the last has not the margins, and must be refused."""
 _AT_ONCE_S = 0.004  # mean delay between hurried commands
 _LONG_STALL, _SILENT = 0.3, 0.5  # fractions of disturbed rests
 _LEARNER, _LEARNS = 0.4, 0.5  # fraction of runs with a learner, and of these, with `learn = "on"`
 _REPORTS_S = 5.0  # mean time between a learner's reports
-_NOTHING_LEARNT, _WORTH_IT = 0.2, 0.7  # fractions of its reports
-# Most amplitude of an experiment's motions. Those of stacks and siderostats may be beyond their range.
-_SWINGS: tuple[tuple[tuple[Channel, ...], float], ...] = (
-    (STACKS, 5.5),
-    (FSM, 1.0),
-    (SIDEROSTAT, 60.0),
-)
 _EXPERIMENTS = 0.4  # fraction of runs with faults in which experiments are met by something
 _COLLECTOR = 0.4  # fraction of the testbed's runs in which its collector is moved on purpose
 _REFERENCED_S = 7.0  # until a reference move has ended
@@ -245,64 +171,6 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
     remote_consoles: int = 0
 
 
-def drawn_search(random: Random) -> Acquire:
-    """A search near the star's expected place, or far from it, so that the siderostat slews at full speed."""
-    return Acquire() if random.random() > _FAR else _far_search(random)
-
-
-def _far_search(random: Random) -> Acquire:
-    az_arcsec, el_arcsec = (random.uniform(-_FAR_ARCSEC, _FAR_ARCSEC) for _ in range(2))
-    return Acquire(expected_az_sky_arcsec=az_arcsec, expected_el_sky_arcsec=el_arcsec)
-
-
-def drawn_target(random: Random) -> SetTarget:
-    """A target anywhere but at the edge of the frame."""
-    return SetTarget(az_px=random.uniform(10, 30), el_px=random.uniform(10, 30))
-
-
-def drawn_experiment(random: Random) -> Experiment:
-    """One to three motions of mirror or siderostat, of up to 10 s; some are beyond what a rig accepts."""
-    return Experiment(
-        name="swarm", drives=[_drawn_drive(random) for _ in range(random.randint(1, 3))]
-    )
-
-
-def _drawn_drive(random: Random) -> Drive:
-    channels, most = random.choice(_SWINGS)
-    return Drive(
-        channel=random.choice(channels),
-        shape=random.choice(("triangle", "sine", "square")),
-        amplitude=random.uniform(0.0, most),
-        frequency_hz=10 ** random.uniform(-1.0, 1.5),
-        duration_s=10 ** random.uniform(-1.0, 1.0),
-        start_s=random.choice((0.0, random.uniform(0.0, 2.0))),
-        end_amplitude=random.choice((None, random.uniform(0.0, most))),
-        end_frequency_hz=random.choice((None, random.uniform(0.1, 30.0))),
-    )
-
-
-def drawn_report(random: Random, loop: str) -> LearnerReport:
-    """A learner's report on a loop, right or wrong; in some, nothing is learnt."""
-    if random.random() < _NOTHING_LEARNT:
-        return LearnerReport(loop=loop, design_json="", text="nothing is learnt", evaluated_s=60.0)
-    present_px, measured_px = random.uniform(0.01, 0.05), random.uniform(0.01, 0.05)
-    return LearnerReport(
-        loop=loop,
-        design_json=random.choice(_LEARNT_DESIGNS),
-        text="a night of the swarm",
-        evaluated_s=random.uniform(60.0, 600.0),
-        present_px=present_px,
-        learnt_px=present_px * random.uniform(0.5, 0.99),
-        bound_px=0.5 * present_px,
-        learnt_camera_px=measured_px * random.uniform(0.5, 1.5),
-        measured_px=measured_px,
-        noise_px=random.uniform(0.003, 0.03),
-        worth_it=random.random() < _WORTH_IT,
-        fits=random.random() < _WORTH_IT,
-        classifying_rate_hz=random.choice((0.0, 47.0, 470.0)),
-    )
-
-
 _MEETS_EXPERIMENT = (
     "stop",
     "off",
@@ -315,141 +183,7 @@ _MEETS_EXPERIMENT = (
     "experiment",
     "shutdown",
 )
-"""Commands that come while an experiment is under way; see `_COMMANDS`."""
-
-_COMMANDS: dict[str, Callable[[Random], AnyCommand | None]] = {
-    "onwards": lambda _: None,
-    "stop": lambda _: Stop(),
-    "off": lambda _: Off(),
-    "recover": lambda _: Recover(),
-    "standby": lambda _: Standby(),
-    "acquire": drawn_search,
-    "release": lambda _: Release(),
-    "status": lambda _: Status(),
-    "take-over": lambda _: TakeOver(),
-    "target": drawn_target,
-    "jog": lambda random: Jog(
-        az_sky_arcsec=random.uniform(-60, 60), el_sky_arcsec=random.uniform(-60, 60)
-    ),
-    "controller": lambda random: SetController(
-        name=random.choice(("eq20", "minimum-variance", "learnt"))
-    ),
-    "sequence-control": lambda random: SequenceControl(
-        action=random.choice(("pause", "resume", "end"))
-    ),
-    "reset": lambda _: Reset(name="dac_watchdog"),
-    "look": lambda random: Look(az_px=random.uniform(5, 35), el_px=random.uniform(5, 35)),
-    "shutdown": lambda random: Shutdown() if random.random() < 0.2 else None,
-    "collector": lambda random: MoveCollector(
-        action=random.choice(("reference", "start", "start", "stop"))
-    ),
-    "bias-offset": lambda random: SetBiasOffset(
-        az_urad=random.uniform(-100, 100), el_urad=random.uniform(-100, 100)
-    ),
-    "experiment": drawn_experiment,
-    "events": lambda _: RecentEvents(),
-    "frame-rate": lambda random: FrameRate(
-        rate_hz=random.choice((47.0, 48.0, 470.0, 480.0)),
-        duration_s=random.uniform(1.0, MOST_RATE_S),
-    ),
-}
-"""By name. ``None`` stands for the command that brings a loop closer to its star."""
-
-
-def slow_servos(rig: str, which: int) -> list[str]:
-    """Settings that slow the servos of a rig's siderostats to 100 or 50 Hz."""
-    return [
-        f"loops.{loop}.siderostat.{key}={values[which]}"
-        for loop in RIGS[rig]
-        for key, values in _SLOW_SERVO.items()
-    ] + [f"interlocks.following_error.high={(3.0, 8.0)[which]}"]
-
-
-def stars_of(rig: str) -> list[str]:
-    """The loops of a rig that point a star."""
-    return [loop for loop in RIGS[rig] if loop != "metrology"]
-
-
-def several_writes(rig: str) -> list[str]:
-    """Settings with which a rig's mirrors are written several times a frame."""
-    return [
-        f"loops.{loop}.{key}"
-        for loop in stars_of(rig)
-        for key in ("fsm.dac.writes_per_frame=5", "vernier.controller=minimum-variance")
-    ]
-
-
-def learning(rig: str) -> list[str]:
-    """Settings with which a rig's loops use learnt designs by themselves."""
-    return [f'loops.{loop}.learn="on"' for loop in stars_of(rig)]
-
-
-def vibrating(rig: str, frequency_hz: float, rms_px: float, direction_deg: float) -> list[str]:
-    """Settings with a vibration in the motion of a rig's stars."""
-    line = (
-        f"{{frequency_hz={frequency_hz:.2f}, rms_px={rms_px:.3f}, direction_deg={direction_deg:.1f}, "
-        "damping=0.01, drift_hz_per_min=0.0}"
-    )
-    return [f"plant.loops.{loop}.lines=[{line}]" for loop in stars_of(rig)]
-
-
-def moving(rig: str, az_arcsec_s: float, el_arcsec_s: float, *, told: bool) -> list[str]:
-    """Settings with stars that move by themselves, as the rig file knows if it is `told`.
-
-    They begin nearer to the start, so that a search about the start finds them however long the run is.
-    """
-    rate = f"star_rate_sky_arcsec_s={{az={az_arcsec_s:.3f}, el={el_arcsec_s:.3f}}}"
-    return [
-        setting
-        for loop in stars_of(rig)
-        for setting in (
-            f"plant.loops.{loop}.{rate}",
-            f"plant.loops.{loop}.star_offset_sky_arcsec_max=150.0",
-            *([f"loops.{loop}.{rate}"] if told else []),
-        )
-    ]
-
-
-def with_another_spot(rig: str, *, told: bool) -> list[str]:
-    """Settings with one more spot in the field of the only star of a rig, too dim for a star.
-
-    On a rig with two stars it would interfere with the spots of the other one.
-    """
-    if len(stars_of(rig)) > 1:
-        return []
-    loop, fringe = stars_of(rig)[0], 'name="fringe", offset_px={az=-12.0, el=0.0}, flux_dn=11000.0'
-    other = 'name="other", offset_px={az=10.0, el=9.0}, flux_dn=6000.0'
-    star = 'name="pointing", offset_px={az=0.0, el=0.0}, flux_dn=28000.0'
-    true = ", ".join(f"{{{spot}, diameter_px=3.0}}" for spot in (star, fringe, other))
-    known = f"loops.{loop}.other_spots=[{{{fringe}}}, {{{other}}}]"
-    return [f"plant.loops.{loop}.spots=[{true}]", *([known] if told else [])]
-
-
-def drawn_sky(random: Random, rig: str) -> list[str]:
-    """Settings of the light and of the stars, most often none."""
-    settings = [PHOTON_NOISE] if random.random() < _SKY else []
-    if random.random() < _SKY:
-        settings += vibrating(
-            rig, random.uniform(1.0, 20.0), random.uniform(0.02, 0.3), random.uniform(0.0, 180.0)
-        )
-    if random.random() < _SKY:
-        told = random.random() < _TOLD
-        # Without being told, Eq. 20 has the mirror at its limit from 0.3 arcsec/s on.
-        most_arcsec_s = 0.3 if told else 0.15
-        az_arcsec_s, el_arcsec_s = (random.uniform(-most_arcsec_s, most_arcsec_s) for _ in range(2))
-        settings += moving(rig, az_arcsec_s, el_arcsec_s, told=told)
-    if random.random() < _SKY:
-        settings += with_another_spot(rig, told=random.random() < _TOLD)
-    return settings
-
-
-def devices_of(rig: str) -> list[str]:
-    """The devices of a rig."""
-    devices = ["camera"]
-    for loop in RIGS[rig]:
-        sensors = ("photodiodes",) if loop == "metrology" else ("D/A", "piezo")
-        devices += [f"{loop} {what}" for what in ("siderostat", *sensors)]
-    return [*devices, "hexapod"] if "metrology" in RIGS[rig] else devices
+"""Commands that come while an experiment is under way; see `COMMANDS`."""
 
 
 def plan_of(seed: int) -> Plan:
@@ -466,9 +200,9 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
     that many faults at once would hide shows in a run that has few of them.
     """
     loops = RIGS[rig]
-    fast = random.random() < _FAST.get(rig, 0.0)
+    fast = random.random() < FAST.get(rig, 0.0)
     duration_s = FAST_DURATION_S if fast else DURATION_S
-    words = random.sample(list(_COMMANDS), random.randint(1, len(_COMMANDS)))
+    words = random.sample(list(COMMANDS), random.randint(1, len(COMMANDS)))
     strikes = _drawn_strikes(random, rig)
     every_s, fault_part = 10 ** random.uniform(-0.3, 1.0), random.uniform(0.05, 0.6)
     # The service refuses commands from operators without the lease.
@@ -497,7 +231,7 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
             while command is not None and random.random() < repeated:
                 again_s += random.expovariate(1 / _REPEATED_S)
                 happenings.append(Order(at_s=again_s, who=who, command=command))
-    settings = _drawn_settings(random, rig, fast=fast)
+    settings = drawn_settings(random, rig, fast=fast)
     if random.random() < _LEARNER:
         happenings += _learner(random, duration_s, stars_of(rig))
         settings += learning(rig) if random.random() < _LEARNS else []
@@ -558,23 +292,10 @@ def _learner(random: Random, duration_s: float, loops: list[str]) -> list[Happen
     return reports
 
 
-def _drawn_settings(random: Random, rig: str, *, fast: bool) -> list[str]:
-    # At the rig's own rate, telemetry takes a tenth of the run's time.
-    settings = ["supervisor.telemetry_hz=5.0"]
-    settings += [text for text in _SETTINGS if random.random() < _SETTING]
-    if fast:
-        settings += _FAST_FRAMES
-    elif random.random() < _SLOW.get(rig, 0.0):
-        settings += slow_servos(rig, random.randrange(2))
-    if not fast and random.random() < _SEVERAL_WRITES:
-        settings += several_writes(rig)
-    return settings + drawn_sky(random, rig)
-
-
 def _drawn_command(
     random: Random, word: str, places: list[SetTarget], loops: tuple[str, ...]
 ) -> AnyCommand | None:
-    command = _COMMANDS[word](random)
+    command = COMMANDS[word](random)
     if places and isinstance(command, SetTarget):
         command = random.choice(places)
     if command is not None and random.random() < _OF_ONE_LOOP:
@@ -606,7 +327,7 @@ def _strike(random: Random, at_s: float, devices: list[str], faults: list[str]) 
 def _interrupted_slew(random: Random, at_s: float, loops: tuple[str, ...]) -> list[Happening]:
     """A loop lets its star go and searches far away; its amplifiers fail, or the computer stalls, meanwhile."""
     loop, who = random.choice(loops), OPERATORS[0]
-    far = msgspec.structs.replace(_far_search(random), loop=loop)
+    far = msgspec.structs.replace(far_search(random), loop=loop)
     fault = "slow" if random.random() < _SLOW_SLEW else random.choice(FAULTS)
     struck_s = at_s + 0.1 + random.uniform(0.0, _SLEW_S)
     failing = _strike(random, struck_s, [f"{loop} siderostat"], [fault])
@@ -625,7 +346,7 @@ def _disturbed_rest(random: Random, at_s: float, loops: tuple[str, ...]) -> list
     Its piezo amplifier may be silent meanwhile.
     """
     loop, who = random.choice(loops), OPERATORS[0]
-    moves = (_COMMANDS["jog"](random), _COMMANDS["bias-offset"](random))
+    moves = (COMMANDS["jog"](random), COMMANDS["bias-offset"](random))
     moved_s = at_s + random.uniform(0.2, 2.0)
     meets_s = moved_s + random.uniform(0.0, _MEETS_S)
     given = [(at_s, Release()), (moved_s, random.choice(moves))]

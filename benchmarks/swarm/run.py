@@ -18,6 +18,7 @@ import msgspec
 import numpy as np
 
 from benchmarks.swarm.clients import Console, Link, RunningSequence
+from benchmarks.swarm.commands import MOST_RATE_S
 from benchmarks.swarm.devices.amplifiers import SwarmAmplifiers
 from benchmarks.swarm.devices.hexapod import SwarmHexapod
 from benchmarks.swarm.devices.mirror import SwarmDac, SwarmPiezo
@@ -25,7 +26,6 @@ from benchmarks.swarm.devices.sensors import SwarmCamera, SwarmPhotodiodes
 from benchmarks.swarm.invariants import Invariants, Violation
 from benchmarks.swarm.lines import FAULTS, Bus, Line
 from benchmarks.swarm.plan import (
-    MOST_RATE_S,
     ClockStep,
     Cloud,
     FullDisk,

@@ -6,11 +6,13 @@ from types import SimpleNamespace
 import msgspec
 import pytest
 
+from benchmarks.swarm.commands import LEARNT_DESIGNS, drawn_report
 from benchmarks.swarm.devices.hexapod import SwarmHexapod
 from benchmarks.swarm.invariants import Invariants
 from benchmarks.swarm.lines import FAULTS, WRONG, Line
 from benchmarks.swarm.past import put_back
-from benchmarks.swarm.plan import _LEARNT_DESIGNS, Order, Plan, Strike, devices_of, drawn_report
+from benchmarks.swarm.plan import Order, Plan, Strike
+from benchmarks.swarm.rigs import devices_of
 from benchmarks.swarm.run import RIGS as FOLDER
 from benchmarks.swarm.run import run_plan
 from benchmarks.swarm.threads import VirtualTime
@@ -394,7 +396,7 @@ def test_an_experiment_that_does_not_end_is_found(monkeypatch):
 def test_a_learnt_design_that_comes_by_itself_at_rest_is_found(monkeypatch):
     report = msgspec.structs.replace(
         drawn_report(Random(1), "right"),
-        design_json=_LEARNT_DESIGNS[0],
+        design_json=LEARNT_DESIGNS[0],
         present_px=0.02,
         learnt_px=0.01,
         worth_it=True,

@@ -7,14 +7,12 @@ import numpy as np
 import pytest
 
 from benchmarks.swarm.clients import STEPS
+from benchmarks.swarm.commands import LEARNT_DESIGNS, drawn_report
 from benchmarks.swarm.devices.amplifiers import SwarmAmplifiers
 from benchmarks.swarm.invariants import Invariants
 from benchmarks.swarm.lines import Line
 from benchmarks.swarm.past import put_back
 from benchmarks.swarm.plan import (
-    _LEARNT_DESIGNS,
-    _SLOW,
-    RIGS,
     Cloud,
     FullDisk,
     Kill,
@@ -24,11 +22,9 @@ from benchmarks.swarm.plan import (
     Sequence,
     Stall,
     Strike,
-    drawn_report,
-    learning,
-    slow_servos,
 )
 from benchmarks.swarm.recorder import ZMQ, SwarmRecorder
+from benchmarks.swarm.rigs import RIGS, SLOW, learning, slow_servos
 from benchmarks.swarm.run import RIGS as FOLDER
 from benchmarks.swarm.run import run_plan
 from benchmarks.swarm.service import SENDERS
@@ -234,7 +230,7 @@ def test_a_loop_may_follow_a_star_that_a_person_pointed_at(invariants, plant):
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("rig", "settings"),
-    [*((rig, []) for rig in RIGS), *((rig, slow_servos(rig, 1)) for rig in _SLOW)],
+    [*((rig, []) for rig in RIGS), *((rig, slow_servos(rig, 1)) for rig in SLOW)],
 )
 def test_each_rig_holds_its_stars_where_nothing_happens(rig, settings):
     quiet = plan(gives(0.1, None), gives(6.0, None), duration_s=7.0, rig=rig, settings=settings)
@@ -247,7 +243,7 @@ def test_each_rig_holds_its_stars_where_nothing_happens(rig, settings):
 def test_a_learnt_design_comes_by_itself_while_the_star_is_held():
     report = drawn_report(Random(1), "right")
     report = msgspec.structs.replace(
-        report, design_json=_LEARNT_DESIGNS[0], present_px=0.02, learnt_px=0.015, worth_it=True
+        report, design_json=LEARNT_DESIGNS[0], present_px=0.02, learnt_px=0.015, worth_it=True
     )
     learner = [gives(float(at_s), report) for at_s in range(2, 40, 4)]
     changes = []

@@ -5,19 +5,15 @@ from typing import get_args
 
 import pytest
 
+from benchmarks.swarm.commands import LEARNT_DESIGNS
 from benchmarks.swarm.lines import FAULTS, WRONG
-from benchmarks.swarm.plan import (
-    _LEARNT_DESIGNS,
-    _SETTINGS,
-    _SLOW,
+from benchmarks.swarm.plan import Happening, Order, Strike, drawn_plan, kind_of
+from benchmarks.swarm.rigs import (
     PHOTON_NOISE,
     RIGS,
-    Happening,
-    Order,
-    Strike,
+    SETTINGS,
+    SLOW,
     devices_of,
-    drawn_plan,
-    kind_of,
     learning,
     moving,
     several_writes,
@@ -35,16 +31,16 @@ KINDS = {kind_of(device) for device in devices_of("fit-testbed.toml")}
 
 @pytest.mark.parametrize("rig", RIGS)
 def test_every_setting_is_one_that_the_rig_can_have(rig):
-    load_rig(FOLDER / rig, list(_SETTINGS))
-    for which in range(2) if rig in _SLOW else ():
-        load_rig(FOLDER / rig, [*_SETTINGS, *slow_servos(rig, which)])
+    load_rig(FOLDER / rig, list(SETTINGS))
+    for which in range(2) if rig in SLOW else ():
+        load_rig(FOLDER / rig, [*SETTINGS, *slow_servos(rig, which)])
     for told in (False, True):
         skies = [
             *vibrating(rig, 20.0, 0.3, 180.0),
             *moving(rig, 0.3, -0.3, told=told),
             *with_another_spot(rig, told=told),
         ]
-        settings = [*_SETTINGS, *several_writes(rig), *learning(rig), PHOTON_NOISE, *skies]
+        settings = [*SETTINGS, *several_writes(rig), *learning(rig), PHOTON_NOISE, *skies]
         load_rig(FOLDER / rig, settings)
 
 
@@ -95,7 +91,7 @@ def test_plans_have_every_command_that_people_and_the_learner_give():
 @pytest.mark.long
 def test_of_the_learnt_designs_the_last_has_not_the_margins():
     rig = load_rig(FOLDER / "fit-mock.toml")
-    *made, refused = _LEARNT_DESIGNS
+    *made, refused = LEARNT_DESIGNS
 
     assert all(design_for(rig, "right", text).learnt for text in made)
     with pytest.raises(ConfigError, match="margins"):
