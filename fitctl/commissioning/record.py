@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Mapping
@@ -66,7 +67,11 @@ class Commissioning(msgspec.Struct):
             time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
             round(took_s, 3),
             outcome.lines,
-            {name: float(f"{value:.6g}") for name, value in outcome.figures.items()},
+            {  # JSON has no other numbers
+                name: float(f"{value:.6g}")
+                for name, value in outcome.figures.items()
+                if math.isfinite(value)
+            },
             outcome.found,
             outcome.trouble,
             1 if earlier is None else earlier.tries + 1,
@@ -138,6 +143,9 @@ class Files:
         names = _include_list(self._source, document)
         if "base" in document:
             document["base"] = placed(str(document["base"]))
+        camera = document.get("camera")
+        if isinstance(camera, dict) and "dark_file" in camera:
+            camera["dark_file"] = placed(str(camera["dark_file"]))
         include = [*map(placed, names), self.found.name]
         text = tomlkit.dumps(document)
         if "include" in document:

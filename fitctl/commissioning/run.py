@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -71,7 +71,25 @@ class Course(NamedTuple):
 
 
 def do(course: Course, task: Task) -> Entry:
-    """Do a task; where it corrects the rig, again with the correction, until nothing is left to correct."""
+    """Do a task; where it corrects the rig, again with the correction, until nothing is left to correct.
+
+    Meanwhile the commissioned rig file has only what was found before the task. It is whole again afterwards,
+    also after an interruption.
+    """
+    with _whole_again(course):
+        return _done(course, task)
+
+
+@contextmanager
+def _whole_again(course: Course) -> Iterator[None]:
+    try:
+        yield
+    finally:
+        order = [task.name for task in tasks_of(load_rig(course.rig_path, course.overrides))]
+        course.files.write_rig(course.record.found(order=order))
+
+
+def _done(course: Course, task: Task) -> Entry:
     began_s = time.monotonic()
     found: dict[str, object] = {}
     lines: list[str] = []
@@ -101,13 +119,14 @@ def do(course: Course, task: Task) -> Entry:
             what = "the corrected values are still not as expected"
             outcome = Outcome(outcome.lines, outcome.figures, found, what)
     figures = outcome.figures if outcome.estimated else outcome.figures | first
-    whole = replace(outcome, lines=lines, figures=figures, found=found)
     earlier = course.record.tasks.get(task.name)
+    if earlier is not None and outcome.trouble and not found:
+        found = earlier.found  # a failure says nothing against it
+    whole = replace(outcome, lines=lines, figures=figures, found=found)
     if earlier is not None and earlier.found != found:
         _forget_dependents(course, task)
     entry = course.record.enter(task.name, whole, time.monotonic() - began_s)
     save(course.files.record, course.record)
-    course.files.write_rig(course.record.found(order=[t.name for t in tasks_of(rig)]))
     return entry
 
 
@@ -121,8 +140,10 @@ def _forget_dependents(course: Course, task: Task) -> None:
 
 
 def skip(course: Course, task: Task, reason: str) -> Entry:
-    """Leave a task out, for a reason that stays in the record."""
-    entry = course.record.enter(task.name, Outcome(trouble=reason), 0.0, "skipped")
+    """Leave a task out, for a reason that stays in the record, with what it found before."""
+    earlier = course.record.tasks.get(task.name)
+    before = Outcome() if earlier is None else Outcome(figures=earlier.figures, found=earlier.found)
+    entry = course.record.enter(task.name, replace(before, trouble=reason), 0.0, "skipped")
     save(course.files.record, course.record)
     return entry
 

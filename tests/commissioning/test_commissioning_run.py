@@ -1,5 +1,6 @@
 """The course of a commissioning: order, repeats, corrections, what is kept."""
 
+import math
 import shutil
 
 import pytest
@@ -215,3 +216,54 @@ def test_the_shipped_table_needs_only_steps_that_come_before(rig):
     for one in tasks_of(rig):
         assert set(one.needs()) <= before
         before.add(one.name)
+
+
+def test_an_interrupted_repeat_leaves_the_commissioned_rig_file_whole(course, table):
+    table(gear=step(corrects_the_gear))
+    do(course, task(course, "gear"))
+
+    def interrupted(_site):
+        raise KeyboardInterrupt
+
+    table(gear=step(interrupted))
+    with pytest.raises(KeyboardInterrupt):
+        do(course, task(course, "gear"))
+
+    assert load_rig(course.files.rig).loops["right"].siderostat.spur_gear_ratio == 26.0
+
+
+def test_a_repeat_that_fails_or_is_skipped_keeps_what_was_found_and_what_depends_on_it(
+    course, table
+):
+    def fails(_site):
+        msg = "the cable is off"
+        raise StepError(msg)
+
+    table(gear=step(corrects_the_gear), later=step(lambda _site: Outcome(), "gear"))
+    do(course, task(course, "gear"))
+    do(course, task(course, "later"))
+    table(gear=step(fails), later=step(lambda _site: Outcome(), "gear"))
+    failed = do(course, task(course, "gear"))
+    skipped = skip(course, task(course, "gear"), "no cable")
+
+    assert (failed.state, failed.found) == ("failed", GEAR)
+    assert (skipped.state, skipped.found) == ("skipped", GEAR)
+    assert course.record.done("right.later")
+    assert load_rig(course.files.rig).loops["right"].siderostat.spur_gear_ratio == 26.0
+
+
+def test_a_figure_without_a_limit_is_left_out_of_the_record(course, table):
+    table(gear=step(lambda _site: Outcome(figures={"margin": math.inf, "gear": 25.0})))
+    do(course, task(course, "gear"))
+
+    assert again(course.rig_path).record.tasks["right.gear"].figures == {"gear": 25.0}
+
+
+def test_files_elsewhere_name_the_same_dark_frame(tmp_path, table):
+    (tmp_path / "there").mkdir()
+    path = tmp_path / "rig.toml"
+    path.write_text(f'base = "{default_rig_path()}"\n[camera]\ndark_file = "dark.npy"\n')
+    files = Files(path, tmp_path / "there")
+    files.write_rig({})
+
+    assert load_rig(files.rig).camera.dark_file == str(tmp_path / "dark.npy")

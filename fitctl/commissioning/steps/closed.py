@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.commissioning.outcome import Outcome, Site, StepError
+from fitctl.daemon.locks import only_master, only_supervisor
 from fitctl.logging.records import Tick
 from fitctl.messages.client import Client
 from fitctl.messages.commands import Acquire, AnyCommand, Recover, Standby, Stop
@@ -221,17 +222,22 @@ def supervised(site: Site, *overrides: str) -> Iterator[Loop]:
     ------
     StepError
         If it does not start, or a device fails.
+    ConfigError
+        If another supervisor has the rig or one of its devices.
     """
-    with tempfile.TemporaryDirectory(prefix="fitctl-commission-") as folder:
-        errors = Path(folder) / "supervisor.err"
+    folder = make_service_folder(site.rig)
+    with only_supervisor(folder), only_master(site.rig):
+        pass  # else the commands below would reach another supervisor
+    with tempfile.TemporaryDirectory(prefix="fitctl-commission-") as scratch:
+        errors = Path(scratch) / "supervisor.err"
         with errors.open("wb") as stderr:
             arguments = rig_arguments(site.rig_path, [*site.overrides, *overrides])
             process = start_process(["run", *arguments], stderr=stderr)
-        client = Client(make_service_folder(site.rig))
+        client = Client(folder)
         try:
             loop = Loop(site, client)
             end_s = time.monotonic() + _START_S
-            while client.receive(0.5) is None:
+            while (heard := client.receive(0.5)) is None or heard.pid != process.pid:
                 if process.poll() is not None or time.monotonic() > end_s:
                     msg = f"the supervisor does not start: {last_line(errors) or 'no message'}"
                     raise StepError(msg)

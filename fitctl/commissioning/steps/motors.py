@@ -42,7 +42,7 @@ class Motors:
     Attributes
     ----------
     position_rad : pair of float
-        As the encoders were last read.
+        As the encoders were last read; zero before :meth:`wait_for_reading`.
     furthest_rad : float
         The largest angle of an encoder from where it was at first.
     """
@@ -86,6 +86,12 @@ class Motors:
                 "the amplifier"
             )
             raise StepError(msg)
+
+    def wait_for_reading(self) -> None:
+        """Command zero velocity until the encoders have been read once; StepError if they cannot be."""
+        self._next_s = self._read_s = self._clock.now_s()
+        while self._at_first_rad is None:
+            self.exchange(_STILL)
 
     def stand(self, for_s: float) -> None:
         """Command zero velocity for a time."""
@@ -182,6 +188,7 @@ def powered(site: Site) -> Iterator[Motors]:
     try:
         amplifiers.open()
         amplifiers.enable()
+        motors.wait_for_reading()
         yield motors
         amplifiers.exchange(_STILL)
     except DeviceFault as error:

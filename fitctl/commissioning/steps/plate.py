@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -87,7 +88,7 @@ def check_star(site: Site) -> Outcome:
                 elif not _moves_a_star(watch):
                     _, looks = search(site, watch, spots)
                 else:
-                    to_the_star(site, watch, watch.spots()[0])
+                    to_the_star(site, watch, _first(watch.spots()))
                 spots = watch.spots()
                 moved_rad = motors.furthest_rad
     if not spots:
@@ -204,6 +205,16 @@ def _refuse_meeting(site: Site, places_px: list[Floats], own_px: Floats, target_
         raise StepError(msg)
 
 
+def _first(seen: Sequence[Any]) -> Any:
+    """The brightest; StepError if there is none."""
+    if not len(seen):
+        msg = (
+            "no star is on the frame any more; look for clouds, and begin with the step star again"
+        )
+        raise StepError(msg)
+    return seen[0]
+
+
 def _rough(site: Site, watch: Watch, axis: int) -> tuple[Floats, Floats]:
     """Pixels a radian of one motor, from a small step; and where the star is that it moves."""
     site.report(f"{'azimuth' if axis == 0 else 'elevation'}: {ROUGH_RAD:g} rad and back")
@@ -214,6 +225,11 @@ def _rough(site: Site, watch: Watch, axis: int) -> tuple[Floats, Floats]:
     watch.turn_to(start_rad + step)
     after = watch.places_px()
     watch.turn_to(start_rad)
+    if not len(before):
+        msg = (
+            "no star is on the frame any more; look for clouds, and begin with the step star again"
+        )
+        raise StepError(msg)
     was_px, is_px = displaced(before, after) or (before[0], before[0])
     moved_px = is_px - was_px
     if np.linalg.norm(moved_px) < LEAST_PX:

@@ -8,11 +8,13 @@ from types import SimpleNamespace
 import pytest
 
 from fitctl.commissioning.outcome import Site, StepError
-from fitctl.commissioning.steps import link
-from fitctl.commissioning.steps.closed import Loop
+from fitctl.commissioning.steps import closed, link
+from fitctl.commissioning.steps.closed import Loop, supervised
 from fitctl.commissioning.tasks import tasks_of
-from fitctl.config import default_rig_path, load_rig
+from fitctl.config import ConfigError, default_rig_path, load_rig
+from fitctl.daemon.locks import only_supervisor
 from fitctl.messages.commands import Acquire, Recover, Reply, SetTarget, Standby
+from fitctl.messages.endpoints import make_service_folder
 
 TESTBED = load_rig(default_rig_path().with_name("fit-testbed.toml"))
 BEAM_ARCSEC = 0.3
@@ -131,3 +133,18 @@ def test_a_beam_that_is_lost_on_the_way_ends_the_step(held):
     client.then = [{}] * 20 + [{"metrology": "COARSE"}]
     with pytest.raises(StepError, match="left LOCKED for COARSE"):
         held(client)
+
+
+@pytest.mark.usefixtures("locks_of_its_own")
+def test_a_supervisor_that_runs_already_is_not_commanded(monkeypatch):
+    site = site_of("right")
+    started = []
+    monkeypatch.setattr(closed, "start_process", lambda *_, **__: started.append(True))
+
+    with (
+        only_supervisor(make_service_folder(site.rig)),
+        pytest.raises(ConfigError, match="another supervisor"),
+        supervised(site),
+    ):
+        pass
+    assert started == []
