@@ -205,6 +205,13 @@ class _Motion:
         self._whiten = whitener(rig, record.loop, self._exposed_s)
         # Until the first full swing is over, the plays' beginnings are not known.
         self._used = self._exposed_s > record.injected_s[0] + 1.5 / SLOWEST_HZ
+        used = int(np.count_nonzero(self._used))
+        if used < _LEAST_FRAMES:
+            msg = (
+                f"delay: {used} frames after the first {1.5 / SLOWEST_HZ:g} s of the motion; expected at least "
+                f"{_LEAST_FRAMES}; let the experiment run to its end"
+            )
+            raise IdentifyError(msg)
         self._wanted = self._whiten(record.star_px[with_star])[self._used]
 
     def misfits(self, shifts_s: Floats) -> Floats:

@@ -126,7 +126,7 @@ def frames_of_log(path: Path, loop_name: str) -> Iterator[TimedImage]:
     Raises
     ------
     IdentifyError
-        If the log has no frames, or none from stages at rest.
+        If the log has no frames, none from stages at rest, or one whose size does not fit its height.
     LogError
         If the log cannot be read, or has no ticks of this loop.
     """
@@ -141,7 +141,7 @@ def frames_of_log(path: Path, loop_name: str) -> Iterator[TimedImage]:
         time_s = entry.publish_time_ns / 1e9 - offset_s
         if start_s - _CLOCK_S <= time_s <= end_s + _CLOCK_S:
             raw: Any = entry.message  # RawImage
-            yield TimedImage(time_s, _image(raw.data, raw.height))
+            yield TimedImage(time_s, _image(raw.data, raw.height, str(path)))
 
 
 def frames_of_records(records: Iterable[AnyRecord], loop_name: str) -> Iterator[TimedImage]:
@@ -150,14 +150,14 @@ def frames_of_records(records: Iterable[AnyRecord], loop_name: str) -> Iterator[
     Raises
     ------
     IdentifyError
-        If there is no such stretch.
+        If there is no such stretch, or a frame's size does not fit its height.
     """
     kept = list(records)
     ticks = [record for record in kept if isinstance(record, Tick) and record.loop == loop_name]
     start_s, end_s = longest_rest(tick_columns(ticks))
     for record in kept:
         if isinstance(record, FrameRecord) and start_s <= record.time_s <= end_s:
-            yield TimedImage(record.time_s, _image(record.data, record.height_px))
+            yield TimedImage(record.time_s, _image(record.data, record.height_px, f"loop {loop_name}"))
 
 
 def longest_rest(ticks: dict[str, NDArray[Any]]) -> tuple[float, float]:
@@ -191,7 +191,13 @@ def longest_rest(ticks: dict[str, NDArray[Any]]) -> tuple[float, float]:
     return float(still_s[0]), float(still_s[-1])
 
 
-def _image(data: bytes, height_px: int) -> NDArray[np.uint16]:
+def _image(data: bytes, height_px: int, of: str) -> NDArray[np.uint16]:
+    if not data or height_px < 1 or len(data) % (2 * height_px):
+        msg = (
+            f"{of}: a frame has {len(data)} bytes for {height_px} rows; expected rows of equal length, two "
+            "bytes a pixel; the record is damaged or not fitctl's: record again"
+        )
+        raise IdentifyError(msg)
     return np.frombuffer(data, dtype="<u2").reshape(height_px, -1)
 
 

@@ -29,7 +29,8 @@ def print_pdf(page: Path, pdf: Path, *, sandbox: bool = True) -> None:
     Raises
     ------
     PdfError
-        If there is no browser, it cannot use its sandbox, or it fails or takes too long.
+        If there is no browser, it cannot use its sandbox, it fails or takes too long, or an earlier PDF cannot be
+        removed.
     """
     browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
     if browser is None:
@@ -44,6 +45,7 @@ def print_pdf(page: Path, pdf: Path, *, sandbox: bool = True) -> None:
             "--pdf-without-sandbox if you trust the log"
         )
         raise PdfError(msg)
+    _remove(pdf)
     with tempfile.TemporaryDirectory(prefix="fitctl-") as profile:
         arguments = [
             "--headless",
@@ -74,3 +76,12 @@ def print_pdf(page: Path, pdf: Path, *, sandbox: bool = True) -> None:
             f"no PDF: {browser} ended with {done.returncode}: {last}; print {page} from any browser"
         )
         raise PdfError(msg)
+
+
+def _remove(pdf: Path) -> None:
+    """An earlier run's, which would pass for this one's where the browser writes nothing."""
+    try:
+        pdf.unlink(missing_ok=True)
+    except OSError as error:
+        msg = f"no PDF: {pdf} cannot be removed: {error.strerror}; remove it, or write to another folder"
+        raise PdfError(msg) from None

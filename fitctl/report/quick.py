@@ -18,6 +18,7 @@ from fitctl.logging.errors import LogError
 from fitctl.logging.reading import HEADER, LogInfo, column_blocks, log_info
 from fitctl.messages.modes import Mode
 from fitctl.report.drawing import SERIES, TimeAxis, envelope, panels, styled, time_axis, trace
+from fitctl.text import plain
 
 Floats = NDArray[np.floating]
 Limits = tuple[float, float]
@@ -194,11 +195,11 @@ def _layout(
     """Series by unit, their labels as short as they differ, and the time axis of all."""
     by_unit: dict[str, list[Series]] = defaultdict(list)
     for one in series:
-        by_unit[one.unit].append(one)
+        by_unit[plain(one.unit)].append(one)
     topics = {one.topic for one in series}
-    labels = {one.label: one.field if len(topics) == 1 else one.label for one in series}
+    labels = {one.label: plain(one.field if len(topics) == 1 else one.label) for one in series}
     last_s = max((float(one.time_s[-1]) for one in series if len(one.time_s)), default=0.0)
-    return by_unit, labels, time_axis(last_s, path.name)
+    return by_unit, labels, time_axis(last_s, plain(path.name))
 
 
 def as_text(
@@ -234,13 +235,13 @@ def as_text(
 
 def _pieces(series: Series) -> Iterator[tuple[Floats, Floats]]:
     """What a terminal draws as lines: none crosses a time without values, unless there are many of them."""
-    there = np.flatnonzero(~np.isnan(series.values))
+    there = np.flatnonzero(np.isfinite(series.values))
     parts = np.split(there, np.flatnonzero(np.diff(there) > 1) + 1)
     for rows in [there] if len(parts) > _MOST_PIECES else parts:
         bins = max(2, round(_TERMINAL_BINS * len(rows) / max(1, len(there))))
         at_s, low, high = envelope(series.time_s[rows], series.values[rows], bins)
         both_s, both = np.repeat(at_s, 2), np.column_stack([low, high]).ravel()
-        drawn = ~np.isnan(both)
+        drawn = np.isfinite(both)
         if drawn.any():
             yield both_s[drawn], both[drawn]
 

@@ -45,7 +45,7 @@ def seconds(value: float) -> str:
     """A length of time for people."""
     if math.isnan(value):
         return UNKNOWN
-    if value < 120:
+    if value < 120 or math.isinf(value):
         return f"{value:.1f} s"
     hours, rest = divmod(round(value), 3600)
     minutes, left = divmod(rest, 60)

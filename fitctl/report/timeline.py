@@ -15,6 +15,7 @@ from fitctl.report.drawing import (
     AZ,
     COLORS,
     EL,
+    FAINT,
     SERIES,
     Plot,
     TimeAxis,
@@ -26,6 +27,7 @@ from fitctl.report.drawing import (
     trace,
 )
 from fitctl.report.findings import AXES, Findings, LoopFindings, StarFindings
+from fitctl.report.tables import UNKNOWN
 from fitctl.tui.inks import FAULT, MODE_COLOURS
 
 if TYPE_CHECKING:
@@ -38,23 +40,22 @@ DIODES = ("az_plus", "az_minus", "el_plus", "el_minus")
 
 
 def running_rms(loop: LoopFindings) -> tuple[Floats, dict[str, Floats]]:
-    """Mean times in windows of `WINDOW_S` and the RMS of each axis' error while held; NaN without a star."""
+    """Mean times in windows of `WINDOW_S` and the RMS of each axis' error while held.
+
+    A window without a star has no value; one NaN, however many there are, parts those before from those after.
+    """
     held = loop.held
     time_s = loop.ticks["time_s"][held]
     if len(time_s) == 0:
         return np.empty(0), {axis: np.empty(0) for axis in AXES}
-    window = np.floor(time_s / WINDOW_S).astype(int)
-    first, last = window[0], window[-1]
-    count = np.bincount(window - first, minlength=last - first + 1)
-    with np.errstate(invalid="ignore"):
-        middles_s = np.bincount(window - first, time_s) / count
-        rms = {
-            axis: np.sqrt(
-                np.bincount(window - first, loop.error(axis)[held].astype(float) ** 2) / count
-            )
-            for axis in AXES
-        }
-    return middles_s, rms
+    windows, row = np.unique(np.floor(time_s / WINDOW_S).astype(int), return_inverse=True)
+    gaps = np.flatnonzero(np.diff(windows) > 1) + 1
+
+    def mean(values: Floats) -> Floats:
+        return np.insert(np.bincount(row, values) / np.bincount(row), gaps, np.nan)
+
+    rms = {axis: np.sqrt(mean(loop.error(axis)[held].astype(float) ** 2)) for axis in AXES}
+    return mean(time_s), rms
 
 
 def timeline(findings: Findings, loop: LoopFindings, time: TimeAxis) -> Plot:
@@ -124,8 +125,8 @@ def _modes_and_events(
         ]
         for begin_s, end_s, mode in _spans(loop):
             fault = mode is Mode.SAFE and any(abs(at_s - begin_s) < 1.0 for at_s in faults_s)
-            color = FAULT.light if fault else MODE_COLOURS[mode.name].light
-            labels["SAFE after a fault" if fault else mode.name] = color
+            label, color = _label_and_color(mode, fault=fault)
+            labels[label] = color
             axes.barh(
                 -row,
                 (end_s - begin_s) / time.s_per_unit,
@@ -146,7 +147,17 @@ def _modes_and_events(
     axes.grid(visible=False, axis="y")
 
 
-def _spans(loop: LoopFindings) -> list[tuple[float, float, Mode]]:
+def _label_and_color(mode: Mode | None, *, fault: bool) -> tuple[str, str]:
+    if mode is None:
+        return f"mode {UNKNOWN}", FAINT
+    if fault:
+        return "SAFE after a fault", FAULT.light
+    return mode.name, MODE_COLOURS[mode.name].light
+
+
+def _spans(loop: LoopFindings) -> list[tuple[float, float, Mode | None]]:
+    """When each mode began and ended; None is one that this version does not know."""
+    known = {int(mode): mode for mode in Mode}
     ticks = loop.ticks
     numbers, time_s = ticks["mode_number"], ticks["time_s"]
     if len(numbers) == 0:
@@ -159,7 +170,7 @@ def _spans(loop: LoopFindings) -> list[tuple[float, float, Mode]]:
         (
             time_s[begin],
             min(time_s[end], time_s[max(begin, end - 1)] + 1.0),
-            Mode(int(numbers[begin])),
+            known.get(int(numbers[begin])),
         )
         for begin, end in zip(begins, ends, strict=True)
     ]

@@ -141,6 +141,12 @@ def test_frames_that_do_not_show_the_motion_are_refused(rig, record):
         )
 
 
+def test_an_experiment_that_ended_soon_is_refused(rig, record):
+    soon = {name: values[:250] for name, values in record.tick.items()}
+    with pytest.raises(IdentifyError, match="run to its end"):
+        delay.analyse(rig, dataclasses.replace(record, tick=soon))
+
+
 def test_a_lost_star_is_refused(rig, record):
     nowhere = np.full_like(record.tick["star_az_px"], np.nan)
     with pytest.raises(IdentifyError, match="0 frames with the star"):

@@ -145,3 +145,19 @@ def test_a_field_without_a_value_leaves_an_empty_panel(held):
 
     assert "star_az_px" in as_text(held[1], series, colours=False)
     assert len(as_figure(held[1], series).axes) == 2
+
+
+def test_values_without_a_limit_are_left_out(held):
+    values = np.array([0.0, 1.0, np.inf, -np.inf, 2.0], dtype=np.float32)
+    text = as_text(held[1], [Series("/t", "x_px", np.arange(5.0), values)], colours=False)
+
+    assert "x_px" in text
+
+
+def test_names_of_a_foreign_log_are_nothing_that_a_terminal_obeys(held):
+    values = np.arange(5.0, dtype=np.float32)
+    series = [Series(f"/{name}", f"x\x1b[2J{name}", np.arange(5.0), values) for name in "ab"]
+    text = as_text(held[1], series, colours=False)
+
+    assert "\x1b" not in text
+    assert "u001b[2J" in text

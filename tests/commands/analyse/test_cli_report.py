@@ -98,6 +98,20 @@ def test_a_browser_that_fails_is_told(script, told, tmp_path, monkeypatch):
         print_pdf(tmp_path / "report.html", tmp_path / "report.pdf", sandbox=False)
 
 
+def test_an_earlier_pdf_does_not_pass_for_one_that_was_not_written(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    browser(tmp_path, "exit 0")
+    page, pdf = tmp_path / "report.html", tmp_path / "report.pdf"
+    pdf.write_bytes(b"%PDF of an earlier run")
+
+    with pytest.raises(PdfError, match="ended with 0: nothing"):
+        print_pdf(page, pdf, sandbox=False)
+    assert not pdf.exists()
+    pdf.mkdir()
+    with pytest.raises(PdfError, match="report.pdf cannot be removed: .*; remove it, or"):
+        print_pdf(page, pdf, sandbox=False)
+
+
 @pytest.mark.parametrize(("user", "needs"), [(0, "as root"), (1000, "cannot use its sandbox")])
 def test_the_browser_never_runs_without_its_sandbox_unless_asked(
     user, needs, tmp_path, monkeypatch
