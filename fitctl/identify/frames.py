@@ -157,7 +157,9 @@ def frames_of_records(records: Iterable[AnyRecord], loop_name: str) -> Iterator[
     start_s, end_s = longest_rest(tick_columns(ticks))
     for record in kept:
         if isinstance(record, FrameRecord) and start_s <= record.time_s <= end_s:
-            yield TimedImage(record.time_s, _image(record.data, record.height_px, f"loop {loop_name}"))
+            yield TimedImage(
+                record.time_s, _image(record.data, record.height_px, f"loop {loop_name}")
+            )
 
 
 def longest_rest(ticks: dict[str, NDArray[Any]]) -> tuple[float, float]:

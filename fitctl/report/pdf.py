@@ -29,8 +29,8 @@ def print_pdf(page: Path, pdf: Path, *, sandbox: bool = True) -> None:
     Raises
     ------
     PdfError
-        If there is no browser, it cannot use its sandbox, it fails or takes too long, or an earlier PDF cannot be
-        removed.
+        If there is no browser, it cannot use its sandbox, it fails or takes too long, or an earlier PDF cannot
+        be removed.
     """
     browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
     if browser is None:

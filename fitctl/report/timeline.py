@@ -42,7 +42,7 @@ DIODES = ("az_plus", "az_minus", "el_plus", "el_minus")
 def running_rms(loop: LoopFindings) -> tuple[Floats, dict[str, Floats]]:
     """Mean times in windows of `WINDOW_S` and the RMS of each axis' error while held.
 
-    A window without a star has no value; one NaN, however many there are, parts those before from those after.
+    Windows that do not follow each other have one NaN between them, however far they are apart.
     """
     held = loop.held
     time_s = loop.ticks["time_s"][held]

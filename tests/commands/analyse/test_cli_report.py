@@ -108,7 +108,7 @@ def test_an_earlier_pdf_does_not_pass_for_one_that_was_not_written(tmp_path, mon
         print_pdf(page, pdf, sandbox=False)
     assert not pdf.exists()
     pdf.mkdir()
-    with pytest.raises(PdfError, match="report.pdf cannot be removed: .*; remove it, or"):
+    with pytest.raises(PdfError, match=r"report\.pdf cannot be removed: .*; remove it, or"):
         print_pdf(page, pdf, sandbox=False)
 
 
