@@ -112,8 +112,12 @@ class Learning:
         return self.setting == "on" and not self._by_hand and self.is_calm(now_s)
 
     def is_calm(self, now_s: float) -> bool:
-        """Nothing hinders a change of design: see `CALM_S`."""
-        return self._calm_since_s is not None and now_s - self._calm_since_s >= CALM_S
+        """Nothing hinders a change of design: see `CALM_S`. Without frames, nothing is known."""
+        return (
+            self._calm_since_s is not None
+            and now_s - self._calm_since_s >= CALM_S
+            and now_s - self._last_s <= self._longest_gap_s
+        )
 
     @property
     def design_json(self) -> str:

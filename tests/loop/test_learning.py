@@ -90,6 +90,14 @@ def test_a_night_that_the_design_in_force_suits_gives_no_event():
     assert night.loop.state(0.0).learning.state == "kept"
 
 
+def test_without_frames_no_learnt_design_is_used():
+    night = Night()
+    now_s = night.simulation.clock.now_s()
+
+    assert night.loop.learning.is_calm(now_s + 0.02)
+    assert not night.loop.learning.is_calm(now_s + 1.0)
+
+
 @pytest.mark.long
 def test_advice_is_withdrawn_with_its_reason(shaken):
     night = Night(*SHAKEN, learn="advise")
