@@ -16,6 +16,7 @@ from benchmarks.swarm.lines import Line
 from fitctl.clock import Clock
 from fitctl.config import Rig
 from fitctl.config.base import ARCSEC_PER_RAD
+from fitctl.controllers.pair import LEARNT
 from fitctl.drivers.interface import AzEl, Pose
 from fitctl.logging.records import (
     AnyRecord,
@@ -346,11 +347,7 @@ class Invariants:
 
     def _controller_changed(self, change: ControllerChange) -> None:
         """Another design is in force; one with a reason was not chosen by an operator."""
-        if (
-            not change.reason
-            or self._supervisor is None
-            or '"learnt": true' not in change.design_json
-        ):
+        if not change.reason or self._supervisor is None or change.target != LEARNT:
             return
         loop = self._supervisor.stellar_loops[change.loop]
         if loop.mode is not Mode.VERNIER or loop.learning.setting != "on":

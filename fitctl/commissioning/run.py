@@ -45,11 +45,15 @@ class Course(NamedTuple):
     quick: bool = False
     cable: Callable[[Cable, bool], None] = nobody_there
 
+    @property
+    def order(self) -> list[str]:
+        """The names of all tasks."""
+        return [task.name for task in tasks_of(load_rig(self.rig_path, self.overrides))]
+
     def rig(self, before: str = "") -> Rig:
         """The rig file with what was found, or with what was found before a task."""
         laid = read_parts(self.rig_path, self.overrides)
-        order = [task.name for task in tasks_of(load_rig(self.rig_path, self.overrides))]
-        lay_over(laid.document, self.record.found(before, order))
+        lay_over(laid.document, self.record.found(before, self.order))
         return rig_from_parts(laid, str(self.rig_path))
 
     def missing(self, task: Task) -> list[str]:
@@ -85,8 +89,7 @@ def _whole_again(course: Course) -> Iterator[None]:
     try:
         yield
     finally:
-        order = [task.name for task in tasks_of(load_rig(course.rig_path, course.overrides))]
-        course.files.write_rig(course.record.found(order=order))
+        course.files.write_rig(course.record.found(order=course.order))
 
 
 def _done(course: Course, task: Task) -> Entry:
@@ -95,7 +98,7 @@ def _done(course: Course, task: Task) -> Entry:
     lines: list[str] = []
     first: dict[str, float] = {}
     rig = course.rig(task.name)
-    course.files.write_rig(course.record.found(task.name, [t.name for t in tasks_of(rig)]))
+    course.files.write_rig(course.record.found(task.name, course.order))
     for attempt in range(_TRIES):
         outcome = _attempt(course.site(task, rig), task)
         lines += outcome.lines
@@ -160,8 +163,7 @@ def _attempt(site: Site, task: Task) -> Outcome:
 
 def _corrected(course: Course, task: Task, found: dict[str, object]) -> Rig:
     laid = read_parts(course.rig_path, course.overrides)
-    order = [one.name for one in tasks_of(load_rig(course.rig_path, course.overrides))]
-    before = course.record.found(task.name, order)
+    before = course.record.found(task.name, course.order)
     lay_over(before, found)
     lay_over(laid.document, before)
     rig = rig_from_parts(laid, str(course.rig_path))

@@ -42,6 +42,7 @@ from fitctl.learn.frame_rates import (
 from fitctl.learn.intervals import Interval
 from fitctl.learn.night import LearntLine, Night
 from fitctl.learn.opened import LEAST_S, Series
+from fitctl.loop.comparison import MOVES_LESS
 
 Floats = NDArray[np.float64]
 WORTH_IT = 0.98
@@ -51,9 +52,9 @@ BETTER_LATELY = 0.995
 UNEXPLAINED = 0.8
 """Instead of `WORTH_IT` and `BETTER_LATELY` where the model does not explain the frames."""
 AS_SHOWN = 0.9
-"""Instead of `WORTH_IT`, where the night shows less than this part of the rig file's mirror gain: a hysteresis
-so unlike the rig file's is no gain alone. With 23 and 24 % instead of 15 %, designs that should have left 2 to
-6 % less left 2 to 4 % more. Between two learnt designs this risk is the same."""
+"""Instead of `WORTH_IT`, where the night shows less than `MOVES_LESS` of the rig file's mirror gain: a
+hysteresis so unlike the rig file's is no gain alone. With 23 and 24 % instead of 15 %, designs that should have
+left 2 to 6 % less left 2 to 4 % more. Between two learnt designs this risk is the same."""
 LATELY_S = 60.0
 MORE_WRITES, MORE_WRITES_WORTH = 5, 0.95
 """The advice mentions so many writes of the D/A in a frame if they lower the bound to this part of it."""
@@ -181,7 +182,7 @@ class Advice(NamedTuple):
     @property
     def _better_as_shown(self) -> bool:
         present_px, learnt_px = self.shown_px
-        moves_less = shown_gain(self.night) < AS_SHOWN
+        moves_less = shown_gain(self.night) < MOVES_LESS
         part = AS_SHOWN if moves_less and self.present.name != LEARNT else WORTH_IT
         return learnt_px <= self._allowed(part) * present_px
 

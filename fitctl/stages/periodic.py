@@ -56,7 +56,7 @@ class PeriodicThread:
         try:
             self._go_on()
         except Exception as error:
-            self._work.threaded = False  # whoever requests work does it then
+            self._work.threaded = False  # the thread that requests work does it then
             self.error = error
             raise
 

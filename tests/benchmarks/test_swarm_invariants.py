@@ -3,10 +3,10 @@
 from random import Random
 from types import SimpleNamespace
 
-import msgspec
 import pytest
+from samples.learner_reports import report
 
-from benchmarks.swarm.commands import LEARNT_DESIGNS, drawn_report
+from benchmarks.swarm.commands import LEARNT_DESIGNS
 from benchmarks.swarm.devices.hexapod import SwarmHexapod
 from benchmarks.swarm.invariants import Invariants
 from benchmarks.swarm.lines import FAULTS, WRONG, Line
@@ -394,16 +394,9 @@ def test_an_experiment_that_does_not_end_is_found(monkeypatch):
 
 @pytest.mark.long
 def test_a_learnt_design_that_comes_by_itself_at_rest_is_found(monkeypatch):
-    report = msgspec.structs.replace(
-        drawn_report(Random(1), "right"),
-        design_json=LEARNT_DESIGNS[0],
-        present_px=0.02,
-        learnt_px=0.01,
-        worth_it=True,
-    )
     happenings = (
         Order(at_s=0.1, who="ada", command=Standby()),
-        Order(at_s=2.0, who="ada", command=report),
+        Order(at_s=2.0, who="ada", command=report(design_json=LEARNT_DESIGNS[0])),
     )
     assert run(*happenings, duration_s=25.0) == set()
     monkeypatch.setattr(Learning, "wants_change", lambda *_: True)

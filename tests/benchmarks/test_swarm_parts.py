@@ -5,9 +5,10 @@ from random import Random
 import msgspec
 import numpy as np
 import pytest
+from samples.learner_reports import report
 
 from benchmarks.swarm.clients import STEPS
-from benchmarks.swarm.commands import LEARNT_DESIGNS, drawn_report
+from benchmarks.swarm.commands import LEARNT_DESIGNS
 from benchmarks.swarm.devices.amplifiers import SwarmAmplifiers
 from benchmarks.swarm.invariants import Invariants
 from benchmarks.swarm.lines import Line
@@ -241,11 +242,8 @@ def test_each_rig_holds_its_stars_where_nothing_happens(rig, settings):
 
 
 def test_a_learnt_design_comes_by_itself_while_the_star_is_held():
-    report = drawn_report(Random(1), "right")
-    report = msgspec.structs.replace(
-        report, design_json=LEARNT_DESIGNS[0], present_px=0.02, learnt_px=0.015, worth_it=True
-    )
-    learner = [gives(float(at_s), report) for at_s in range(2, 40, 4)]
+    learnt = report(design_json=LEARNT_DESIGNS[0])
+    learner = [gives(float(at_s), learnt) for at_s in range(2, 40, 4)]
     changes = []
 
     def keep(record):

@@ -225,12 +225,7 @@ def _rough(site: Site, watch: Watch, axis: int) -> tuple[Floats, Floats]:
     watch.turn_to(start_rad + step)
     after = watch.places_px()
     watch.turn_to(start_rad)
-    if not len(before):
-        msg = (
-            "no star is on the frame any more; look for clouds, and begin with the step star again"
-        )
-        raise StepError(msg)
-    was_px, is_px = displaced(before, after) or (before[0], before[0])
+    was_px, is_px = displaced(before, after) or (_first(before), _first(before))
     moved_px = is_px - was_px
     if np.linalg.norm(moved_px) < LEAST_PX:
         name = "azimuth" if axis == 0 else "elevation"

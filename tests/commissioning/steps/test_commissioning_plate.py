@@ -1,6 +1,7 @@
 """What measured motions of the star make of the rig file: order, signs, rotation, scale."""
 
 import itertools
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from fitctl.commissioning.steps.mirror import _mirror_outcome
 from fitctl.commissioning.steps.plate import (
     _flipped,
     _refuse_meeting,
+    _rough,
     _siderostat_outcome,
     similar,
 )
@@ -131,3 +133,9 @@ def test_a_star_is_not_sent_where_another_one_is():
         _refuse_meeting(site_of(), [LEFT_PX, RIGHT_PX], LEFT_PX, TARGET_PX)
     _refuse_meeting(site_of(), [LEFT_PX, RIGHT_PX], RIGHT_PX, TARGET_PX)
     _refuse_meeting(site_of(), [LEFT_PX], LEFT_PX, TARGET_PX)
+
+
+def test_no_star_on_the_frame_is_one_clear_line():
+    dark = SimpleNamespace(goal_rad=np.zeros(2), turn_to=lambda _: None, places_px=list)
+    with pytest.raises(StepError, match="no star is on the frame any more"):
+        _rough(site_of(), dark, 0)
