@@ -484,7 +484,9 @@ def _line_text(line: LineAdvice) -> str:
     if line.true_hz == found.frequency_hz.value:
         done += "; another frame rate showed that it is no alias"
     elif line.true_hz is not None:
-        done += f"; another frame rate showed that it is an alias of {line.true_hz:.1f} Hz"
+        done += (
+            f"; another frame rate showed that it is an alias, probably of {line.true_hz:.1f} Hz"
+        )
     if_alias = (
         f"\n             if it is at {fast} Hz instead: present {line.if_alias.present_px:.4f}, "
         f"learnt {line.if_alias.learnt_px:.4f} px"

@@ -223,10 +223,12 @@ def _shown(
             for one in with_one(at, best_hz)
         ]
         best, second, *_ = np.argsort(each)
-        true_hz, else_hz = places_hz[line][best], places_hz[line][second if best == 0 else 0]
+        # Which alias it is may stay open: frames show them alike, and the design leaves each alone.
+        otherwise = second if best == 0 else 0
+        true_hz, else_hz = places_hz[line][best], places_hz[line][otherwise]
         looks_slow = true_hz == line.frequency_hz.value and _looks_slow(true_hz, rate_hz, others)
         hidden = all(seen_at_hz(true_hz, 1 / other.period_s) < _HIDDEN_HZ for other in others)
-        if each[second] - each[best] < _SURE or looks_slow or hidden:
+        if each[otherwise] - each[best] < _SURE or looks_slow or hidden:
             continue
         there = with_one(at, best_hz)[best]
         both = [*at_hz(there).items(), (line, else_hz)]
