@@ -77,7 +77,7 @@ def gather(records: Iterable[Any], loop: str, name: str) -> ExperimentRecord:
     Raises
     ------
     IdentifyError
-        If there is none, or nothing of it.
+        If there is none, nothing of it, or times or voltages that cannot be.
     """
     begun = over = False
     ticks: list[Any] = []
@@ -106,8 +106,16 @@ def gather(records: Iterable[Any], loop: str, name: str) -> ExperimentRecord:
             f"run `fitctl identify {name}` on the rig first"
         )
         raise IdentifyError(msg)
-    table = np.array(injected)
-    return ExperimentRecord(loop, tick_columns(ticks), table[:, 0], table[:, 1:])
+    table, tick = np.array(injected), tick_columns(ticks)
+    apart_s = np.diff(table[:, 0]), np.diff(tick["time_s"])
+    ascends = all(np.isfinite(apart).all() and (apart >= 0).all() for apart in apart_s)
+    if not (ascends and np.isfinite(table).all() and np.isfinite(tick["time_s"]).all()):
+        msg = (
+            f"the experiment {name} on loop {loop} has times or voltages that are not finite, or times that "
+            f"go back; expected those of one run; use its whole log, or run `fitctl identify {name}` again"
+        )
+        raise IdentifyError(msg)
+    return ExperimentRecord(loop, tick, table[:, 0], table[:, 1:])
 
 
 def gather_log(path: Path, loop: str, name: str) -> ExperimentRecord:
@@ -116,7 +124,7 @@ def gather_log(path: Path, loop: str, name: str) -> ExperimentRecord:
     Raises
     ------
     IdentifyError
-        If there is none.
+        If there is none, or it cannot be.
     LogError
         If the log cannot be read.
     """

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from fitctl.controllers.design.linear_loop.spectrum import seen_at_hz
 from fitctl.learn.night import LEAST_LINE_HZ, LearntLine, Night, guess_of
 from fitctl.learn.opened import Opened, Series, periodograms
-from fitctl.learn.whittle import LineGuess, likeliest
+from fitctl.learn.whittle import LineGuess, Near, likeliest
 from fitctl.loop.frame_rate import OTHER_RATE, frames_watched
 
 Floats = NDArray[np.float64]
@@ -33,17 +33,18 @@ SAME_LINE_HZ = 0.3
 WORTH_CLASSIFYING = 0.9
 """A design that knows which lines are aliases must leave at most this part, or another rate is not worth it."""
 _ROUNDS = 3
-_STAYS_HZ = 0.2
-"""So far a line may be from where it is expected, and so wide,"""
-_BROADER = 3.0
-"""or so many times as wide as the night has it, and so much"""
+_NEAR = Near(away_hz=0.2, broader=3.0)
+"""So near a line must be to where it is expected,"""
+_INSIDE = 0.99  # of that way
 _WEAKER = 0.4
-"""of its RMS it must have: beyond that it explains something else. A narrow line has less for a seventh of the
-time, and is not classified then."""
+"""and so much of its RMS it must have: beyond that it explains something else. A narrow line has less for a
+seventh of the time, and is not classified then."""
 _HIDDEN_HZ = 0.5
 """Below this, air looks like a line."""
 _SURE = 6.0
 """By how much the logarithm of the likelihood must be higher in one case: it is 400 times as likely."""
+_SURE_OF_TWO = 10.0
+"""The same with one line more: its four numbers make it higher by one each if there is no such line."""
 
 
 class Classified(NamedTuple):
@@ -195,8 +196,11 @@ def _shown(
         return dict(zip(places_hz, places, strict=True)) | unsuspected_hz
 
     @functools.cache
+    def fits(*places: float) -> list[_Fit]:
+        return [_fit(night, at_hz(places).items(), other) for other in others]
+
     def cost(*places: float) -> float:
-        return sum(_cost(night, at_hz(places).items(), other) for other in others)
+        return sum(fit.cost for fit in fits(*places))
 
     def with_one(at: int, places: Sequence[float]) -> list[tuple[float, ...]]:
         """One line at each of its places, and the others where they are."""
@@ -222,29 +226,42 @@ def _shown(
             cost(*one) + likeliest(opened, guess_of(night, at_hz(one).items())).cost
             for one in with_one(at, best_hz)
         ]
-        best, second, *_ = np.argsort(each)
-        # Which alias it is may stay open: frames show them alike, and the design leaves each alone.
-        otherwise = second if best == 0 else 0
-        true_hz, else_hz = places_hz[line][best], places_hz[line][otherwise]
+        best = int(np.argmin(each))
+        true_hz = places_hz[line][best]
+        # Which alias it is may stay open where all rates show them alike: the design leaves each alone.
+        differ = [
+            place
+            for place, hz in enumerate(places_hz[line])
+            if place != best and (0 in (place, best) or not _look_alike(hz, true_hz, others))
+        ]
+        otherwise = min(differ, key=each.__getitem__)
+        else_hz = places_hz[line][otherwise if best == 0 else 0]
         looks_slow = true_hz == line.frequency_hz.value and _looks_slow(true_hz, rate_hz, others)
         hidden = all(seen_at_hz(true_hz, 1 / other.period_s) < _HIDDEN_HZ for other in others)
-        if each[otherwise] - each[best] < _SURE or looks_slow or hidden:
-            continue
         there = with_one(at, best_hz)[best]
+        is_found = any(line in fit.found for fit in fits(*there))
+        if each[otherwise] - each[best] < _SURE or looks_slow or hidden or not is_found:
+            continue
         both = [*at_hz(there).items(), (line, else_hz)]
         # If it is seen at both places, two vibrations look the same at the usual rate.
-        if cost(*there) - sum(_cost(night, both, other) for other in others) < _SURE:
+        if cost(*there) - sum(_fit(night, both, other).cost for other in others) < _SURE_OF_TWO:
             shown[line.frequency_hz.value] = true_hz
     return shown
+
+
+def _look_alike(one_hz: float, two_hz: float, others: Sequence[Opened]) -> bool:
+    """Whether all these rates show two vibrations at the same place."""
+    rates_hz = [1 / other.period_s for other in others]
+    return all(
+        abs(seen_at_hz(one_hz, rate) - seen_at_hz(two_hz, rate)) <= SAME_LINE_HZ
+        for rate in rates_hz
+    )
 
 
 def _looks_slow(line_hz: float, rate_hz: float, others: Sequence[Opened]) -> bool:
     """Whether a line faster than those that are looked for would look like this slow one at all other rates."""
     faster = _true_hz(line_hz, rate_hz, _MORE_MULTIPLES)[len(_true_hz(line_hz, rate_hz)) :]
-    return any(
-        all(abs(seen_at_hz(hz, 1 / other.period_s) - line_hz) <= SAME_LINE_HZ for other in others)
-        for hz in faster
-    )
+    return any(_look_alike(hz, line_hz, others) for hz in faster)
 
 
 def _places_hz(
@@ -264,24 +281,45 @@ def _true_hz(line_hz: float, rate_hz: float, multiples: int = _MULTIPLES) -> lis
     ]
 
 
-def _cost(night: Night, places_hz: Iterable[tuple[LearntLine, float]], opened: Opened) -> float:
-    """Negative logarithm of the likelihood of what another rate shows, with the lines at these places."""
+class _Fit(NamedTuple):
+    """What another rate shows with lines at certain places.
+
+    Attributes
+    ----------
+    cost : float
+        Negative logarithm of the likelihood.
+    found : frozenset of LearntLine
+        The lines that are where they are expected.
+    """
+
+    cost: float
+    found: frozenset[LearntLine]
+
+
+def _fit(night: Night, places_hz: Iterable[tuple[LearntLine, float]], opened: Opened) -> _Fit:
+    """The likeliest spectrum with the lines at these places, and without those that are too weak there."""
     rate_hz = 1 / opened.period_s
     seen_hz = [(line, max(LEAST_LINE_HZ, seen_at_hz(hz, rate_hz))) for line, hz in places_hz]
     begin = guess_of(night, seen_hz)
     # A mirror that may move otherwise than it did explains away a line that is not where it should be.
-    end = likeliest(opened, begin, free_mirror=False)
-    both = zip(begin.lines, end.guess.lines, strict=True)
-    stayed = tuple(line for line, found in both if _is_that_line(line, found))
-    if len(stayed) < len(begin.lines):  # a line that is not there has gone to explain another
-        end = likeliest(opened, begin._replace(lines=stayed), free_mirror=False)
-    return end.cost
+    end = likeliest(opened, begin, free_mirror=False, near=_NEAR)
+    strong = [
+        (line, expected, found)
+        for (line, _), expected, found in zip(seen_hz, begin.lines, end.guess.lines, strict=True)
+        if _is_strong(expected, found)
+    ]
+    if len(strong) < len(begin.lines):
+        stayed = tuple(expected for _, expected, _ in strong)
+        end = likeliest(opened, begin._replace(lines=stayed), free_mirror=False, near=_NEAR)
+    there = (line for line, expected, found in strong if _is_inside(expected, found))
+    return _Fit(end.cost, frozenset(there))
 
 
-def _is_that_line(line: LineGuess, found: LineGuess) -> bool:
-    """Whether what a search has found is still the line with which it began."""
-    return (
-        abs(found.frequency_hz - line.frequency_hz) <= _STAYS_HZ
-        and found.half_width_hz <= max(_BROADER * line.half_width_hz, _STAYS_HZ)
-        and float(np.max(found.rms_px)) >= _WEAKER * float(np.max(line.rms_px))
-    )
+def _is_strong(line: LineGuess, found: LineGuess) -> bool:
+    """Whether what a search has found is strong enough for the line with which it began."""
+    return float(np.max(found.rms_px)) >= _WEAKER * float(np.max(line.rms_px))
+
+
+def _is_inside(line: LineGuess, found: LineGuess) -> bool:
+    """Whether it would not go farther: what stops at the limit explains something else."""
+    return abs(found.frequency_hz - line.frequency_hz) < _INSIDE * _NEAR.away_hz

@@ -56,6 +56,13 @@ class LineGuess(NamedTuple):
     rms_px: Floats
 
 
+class Near(NamedTuple):
+    """How far a line may be from where it is expected, and how many times as broad, or as broad as that."""
+
+    away_hz: float
+    broader: float
+
+
 class Guess(NamedTuple):
     """A spectrum: air path, noise of a frame in px, gain and overshoot of the mirror, lines."""
 
@@ -94,9 +101,14 @@ class Likeliest:
         return self.find_covariance()
 
 
-def likeliest(opened: Opened, begin: Guess, *, free_mirror: bool = True) -> Likeliest:
-    """Search from a first guess; the number of lines stays, and the mirror if it is not free."""
-    problem = _Problem(opened, begin, free_mirror=free_mirror)
+def likeliest(
+    opened: Opened, begin: Guess, *, free_mirror: bool = True, near: Near | None = None
+) -> Likeliest:
+    """Search from a first guess; the number of lines stays, and the mirror if it is not free.
+
+    Lines may move and broaden as far as the periodograms show them, or no farther than `near`.
+    """
+    problem = _Problem(opened, begin, free_mirror=free_mirror, near=near)
     values, cost = _lowest(problem)
     guess = problem.guess(values)
     density = _Place(problem, values).density
@@ -137,7 +149,14 @@ class _Problem:
     Arrays are of shape (axes, rows), as those of :class:`_Place` are.
     """
 
-    def __init__(self, opened: Opened, begin: Guess, *, free_mirror: bool = True) -> None:
+    def __init__(
+        self,
+        opened: Opened,
+        begin: Guess,
+        *,
+        free_mirror: bool = True,
+        near: Near | None = None,
+    ) -> None:
         self.opened = opened
         self.axes = opened.disturbance.shape[1]
         self.weight = opened.segments / opened.inflation
@@ -158,17 +177,22 @@ class _Problem:
         for line in begin.lines:
             width = math.log(max(line.half_width_hz, self.resolution_hz * _NARROWEST * 2))
             seen_hz = seen_at_hz(line.frequency_hz, 1 / opened.period_s)
-            widest = math.log(BROADEST * seen_hz)
+            widest_hz, farthest = BROADEST * seen_hz, _FARTHEST
+            if near is not None:
+                broader_hz = max(near.broader * line.half_width_hz, near.away_hz)
+                widest_hz = min(widest_hz, broader_hz)
+                farthest = min(farthest, near.away_hz / self.resolution_hz)
+            widest = math.log(widest_hz)
             to_end_hz = 0.5 / opened.period_s - seen_hz
             # The search may not move an alias past a multiple of half the frame rate.
             is_alias = line.frequency_hz > seen_hz
             most_hz = _ALIAS_REACH * min(seen_hz, to_end_hz) if is_alias else to_end_hz
-            away = min(_FARTHEST, most_hz / self.resolution_hz)
+            away = min(farthest, most_hz / self.resolution_hz)
             rms = np.log(np.maximum(line.rms_px, 1e-3 * begin.noise_px)).tolist()
             first += [0.0, min(width, widest), *rms]
             centre += [0.0, math.log(self.resolution_hz), *rms]
             bounds += [
-                (-away if is_alias else -_FARTHEST, away),
+                (-away if is_alias else -farthest, away),
                 (math.log(_NARROWEST * self.resolution_hz), widest),
                 *[(value - 8, value + 8) for value in rms],
             ]

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from operator import itemgetter
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,6 +41,21 @@ _KINDS: dict[Any, str] = {
     DeviceHealth: "health",
     SequenceAttempt: "attempts",
     RecorderStatus: "recorder",
+}
+_NUMBERS, _TEXT = "fib", "U"  # as numpy names kinds of values
+_FIELDS: dict[str, dict[str, str]] = {
+    name: {
+        one.name: _NUMBERS if one.type in (int, float) else _TEXT
+        for one in msgspec.structs.fields(kind)
+    }
+    for kind, name in _KINDS.items()
+} | {
+    "events": {"level": _NUMBERS, "name": _TEXT, "message": _TEXT},  # as Foxglove has them
+    "recorder": {"lost": _NUMBERS},
+}
+_DEFAULTS: dict[str, dict[str, Any]] = {
+    name: {one.name: one.default for one in msgspec.structs.fields(kind) if not one.required}
+    for kind, name in _KINDS.items()
 }
 TICK_FIELDS: dict[str, Any] = {
     "time_s": np.float64,
@@ -150,7 +166,7 @@ def gather(run: Run) -> Gathered:
     Raises
     ------
     LogError
-        If a file cannot be read, or its ticks lack what a report needs.
+        If a file cannot be read, or its records lack what a report needs.
     """
     loops = list(run.rig.loops)
     places = {
@@ -165,14 +181,14 @@ def gather(run: Run) -> Gathered:
     health: list[dict[str, Any]] = []
     states: dict[str, str] = {}
     fields: dict[str, Any] = {topic: wanted for topic, (_, wanted) in series.items()}
-    fields[TOPICS[RecorderStatus]] = ["lost"]
+    fields[TOPICS[RecorderStatus]] = list(_FIELDS["recorder"])
     for log in run.logs:
         for topic, columns in column_blocks(log.path, [*series, *places], _ROWS, fields):
             time_s = (columns["publish_time_ns"] - run.start_ns) / 1e9
             if topic in series:
                 filled[topic] += _fill(rooms[topic], filled[topic], columns, time_s, str(log.path))
                 continue
-            block = columns | {"time_s": time_s}
+            block = _whole(places[topic][0], columns, str(log.path)) | {"time_s": time_s}
             if places[topic][0] == "health":  # says the same every second, all night
                 health += _changes(_rows([block]), states)
             else:
@@ -220,9 +236,7 @@ def _room(run: Run, topic: str, wanted: dict[str, Any]) -> Columns:
 def _fill(room: Columns, at: int, columns: Columns, time_s: NDArray[np.float64], path: str) -> int:
     """Put a block of ticks into their room, from row `at` on; returns how many rows there was room for."""
     missing = [name for name in room if name not in columns and name not in LATER_FIELDS]
-    if missing:
-        msg = f"{path}: its ticks lack {', '.join(missing)}; it was recorded by another version of fitctl"
-        raise LogError(msg)
+    _require(missing, columns, dict.fromkeys(room, _NUMBERS), "ticks", path)
     block = columns | {"time_s": time_s}
     if "mid_exposure_s" in room:
         block["mid_exposure_s"] = columns["mid_exposure_s"] + (time_s - columns["time_s"])
@@ -230,8 +244,37 @@ def _fill(room: Columns, at: int, columns: Columns, time_s: NDArray[np.float64],
         len(time_s), len(room["time_s"]) - at
     )  # a log in the making has grown since it was counted
     for name, column in room.items():
-        column[at : at + rows] = block[name][:rows] if name in block else LATER_FIELDS[name]
+        values = block[name][:rows] if name in block else LATER_FIELDS[name]
+        if name == "mode_number":  # of a foreign log, perhaps too large for its column
+            values = np.clip(values, -1, np.iinfo(column.dtype).max)
+        column[at : at + rows] = values
     return rows
+
+
+def _whole(name: str, columns: Columns, path: str) -> Columns:
+    """A block of records with the fields that logs of earlier versions lack, each as its default."""
+    fields = _FIELDS[name]
+    missing = [each for each in fields if each not in columns and each not in _DEFAULTS[name]]
+    _require(missing, columns, fields, f"records of {name}", path)
+    rows = len(columns["publish_time_ns"])
+    filled = {each: np.full(rows, default) for each, default in _DEFAULTS[name].items()}
+    return filled | columns
+
+
+def _require(
+    missing: list[str], columns: Columns, kinds: dict[str, str], what: str, path: str
+) -> None:
+    """Refuse columns that are missing, and those that hold values of another kind."""
+    if missing:
+        msg = f"{path}: its {what} lack {', '.join(missing)}; it was recorded by another version of fitctl"
+        raise LogError(msg)
+    for name, kind in kinds.items():
+        if name in columns and columns[name].dtype.kind not in kind:
+            msg = (
+                f"{path}: {name} of its {what} is {columns[name].dtype.name}; expected "
+                f"{'text' if kind == _TEXT else 'numbers'}; it was not recorded by fitctl"
+            )
+            raise LogError(msg)
 
 
 def _joined(blocks: list[Columns]) -> Columns:

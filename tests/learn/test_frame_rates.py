@@ -176,6 +176,17 @@ def test_a_line_with_an_alias_in_its_place_is_not_called_one(paper, fixed, seed)
     assert classified(paper, fixed, truth, truth, classifying_rate([3.1], RATE_HZ), seed) == []
 
 
+def test_a_line_that_explains_part_of_another_is_not_called_an_alias(paper, fixed):
+    """What looks like one broad line is two at 47 frames/s, of which the alias is near other aliases."""
+    air = paper.air_path.model_copy(update={"gain_px": 0.25, "b1_s2": 0.58})
+    slow, one = Line(1.1, 0.003, 0.04), Line(11.4, 0.03, 0.012)
+    two = (Line(11.79, 0.001, 0.005), Line(38.74, 0.02, 0.015))
+    truth = dataclasses.replace(paper, lines=(slow, one), air_path=air)
+    other = dataclasses.replace(truth, lines=(slow, *two))
+
+    assert not any(one.is_alias for one in classified(paper, fixed, truth, other, 47.0, 10))
+
+
 @pytest.mark.parametrize("seed", [0, pytest.param(2, marks=pytest.mark.long)])
 def test_what_would_be_seen_near_zero_is_not_classified(paper, fixed, seed):
     """There air looks like a line; at 48.5 frames/s this alias is at 0.3 Hz, on a night of little air."""

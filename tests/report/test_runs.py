@@ -5,9 +5,12 @@ import json
 import re
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
+from google.protobuf.descriptor_pool import DescriptorPool
 from mcap.writer import Writer
+from mcap_protobuf.writer import Writer as McapWriter
 from samples.logged_simulation import designs_of
 from samples.report_samples import record
 
@@ -16,7 +19,8 @@ from fitctl.daemon.run import run_info
 from fitctl.logging.copying import cut
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import log_info
-from fitctl.logging.records import Event, RecorderStatus
+from fitctl.logging.records import DeviceHealth, Event, Record, RecorderStatus
+from fitctl.logging.schemas import TOPICS, message_class, run_metadata
 from fitctl.logging.writer import LogWriter
 from fitctl.report.findings import find
 from fitctl.report.gather import gather
@@ -123,6 +127,65 @@ def test_every_recorder_counts_its_own_losses(rig, tmp_path):
             log.write(status, 1.8e9 + second)
 
     assert gather(find_run([path])).lost == 7
+
+
+class Health(Record, frozen=True, kw_only=True):
+    """A device's health as an earlier version may have recorded it: no state."""
+
+    device: str
+
+
+class Tick(Record, frozen=True, kw_only=True):
+    loop: str
+    mode_number: str
+
+
+class ModeChange(Record, frozen=True, kw_only=True):
+    loop: str
+    source: str
+    target: float
+    target_number: int
+    trigger: str
+    reason: str
+
+
+@pytest.mark.parametrize(
+    ("topic", "record", "told"),
+    [
+        (
+            TOPICS[DeviceHealth],
+            Health(time_s=1.0, device="camera"),
+            "records of health lack .*state",
+        ),
+        ("/fit/right/tick", Tick(time_s=1.0, loop="right", mode_number="x"), "its ticks lack"),
+        (
+            "/fit/right/mode",
+            ModeChange(
+                time_s=1.0,
+                loop="right",
+                source="OFF",
+                target=1.0,
+                target_number=1,
+                trigger="x",
+                reason="",
+            ),
+            "target of its records of modes is float64; expected text",
+        ),
+    ],
+)
+def test_records_of_another_shape_are_refused_in_one_line(rig, tmp_path, topic, record, told):
+    path = tmp_path / "shaped.mcap"
+    kind = message_class(type(record), DescriptorPool())
+    with path.open("wb") as stream, McapWriter(stream) as writer:
+        info = run_info(rig, "simulated", now_s=0.0, designs=designs_of(rig))
+        for name, values in run_metadata(info).items():
+            writer._writer.add_metadata(name, values)
+        writer.write_message(topic, kind(**msgspec.structs.asdict(record)), 10**18, 10**18)
+
+    with pytest.raises(LogError, match=told) as raised:
+        gather(find_run([path]))
+
+    assert "\n" not in str(raised.value)
 
 
 def foreign(path, metadata):

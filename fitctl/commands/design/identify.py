@@ -121,6 +121,9 @@ def identify(
     if plot_path.suffix not in _PLOT_SUFFIXES:
         msg = f"identify: {plot_path}: plots are {' or '.join(_PLOT_SUFFIXES)}; name another with --plot"
         raise ConfigError(msg)
+    if plot_path.resolve() == fragment_path.resolve():
+        msg = f"identify: {plot_path}: is both the fragment and the plot; name another with --out or --plot"
+        raise ConfigError(msg)
     _require_output(plot_path)
     try:
         with ended_by_signals(interrupt), progress_line(f"identify {what}") as progress:

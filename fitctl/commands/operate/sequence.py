@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
     from fitctl.logging.records import SequenceAttempt
     from fitctl.messages.commands import SequenceStatus
+    from fitctl.sequences.behaviours.behaviour import Calibration
     from fitctl.sequences.links import Link
     from fitctl.sequences.steps import Sequence
     from fitctl.simulation.simulation import Simulation
@@ -266,6 +267,7 @@ def _run(rig: Rig, sequence: Sequence, link: Link, out: Path | None, *, as_json:
     if out is not None and any(step.step in CALIBRATING for step in sequence.steps):
         require_folder(out)
     attempts: list[SequenceAttempt] = []
+    measured: list[Calibration] = []
     failure = "interrupted"
     try:
         with (
@@ -282,19 +284,20 @@ def _run(rig: Rig, sequence: Sequence, link: Link, out: Path | None, *, as_json:
                 progress(steps_done, where(status))
 
             runner = Runner(Contact(link, rig, sequence.name, len(sequence.steps), show))
+            measured = runner.calibrations
             run_steps(runner, sequence.steps)
             failure = ""
     except (SequenceError, ConnectionError) as error:
         failure = str(error)
-    finally:
+    finally:  # an interrupt loses nothing of what was measured before
         if as_json:
             say(as_json_text(sequence.name, failure, attempts))
         elif attempts:
             say_lines(attempts_text(attempts))
-    if out is not None:
-        for calibration in runner.calibrations:
-            path = write_calibration(calibration, rig, out)
-            say(f"written: {path} (name it in the rig file's include list)", err=as_json)
+        if out is not None:
+            for calibration in measured:
+                path = write_calibration(calibration, rig, out)
+                say(f"written: {path} (name it in the rig file's include list)", err=as_json)
     if failure:
         say(f"sequence {sequence.name}: {failure}", err=True)
         return FAILED

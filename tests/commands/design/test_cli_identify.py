@@ -39,6 +39,7 @@ def identify(capsys, monkeypatch, tmp_path):
         (["--out", "nowhere/a.toml"], "nowhere/a.toml"),
         (["--plot", "nowhere/a.png"], "nowhere/a.png"),
         (["--out", "."], "nothing can be written"),
+        (["--out", "a.png"], "both the fragment and the plot"),
         (["--mocks"], "exclude each other"),
         (["--log", "a.mcap"], "exclude each other"),
         (["--loop", "left"], "left"),

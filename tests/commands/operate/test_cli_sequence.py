@@ -8,6 +8,7 @@ import tomli_w
 
 from fitctl.cli import main
 from fitctl.sequences.files import shipped_sequences
+from fitctl.sequences.runner import Runner
 
 HEAD = 'schema_version = 1\nname = "tried"\ndescription = "Of a test."\n'
 WAIT = HEAD + 'steps = [{ step = "wait", duration_s = 5.0 }]\n'
@@ -122,6 +123,26 @@ def test_a_dry_run_that_fails_has_status_1_and_says_why(sequence, tmp_path):
     assert told["attempts"][0]["figures"] == {}
     assert "hold needs VERNIER" in told["failure"]
     assert err.splitlines()[-1] == f"sequence tried: {told['failure']}"
+
+
+def test_an_interrupt_keeps_what_was_measured_before_it(sequence, tmp_path, monkeypatch):
+    run = Runner.run
+
+    def interrupted(self, step):
+        if step.step == "wait":
+            raise KeyboardInterrupt
+        return run(self, step)
+
+    monkeypatch.setattr(Runner, "run", interrupted)
+    steps = (
+        'steps = [{ step = "standby" }, { step = "dark" }, { step = "wait", duration_s = 5.0 }]\n'
+    )
+    path = written(tmp_path, HEAD + steps)
+    status, out, _ = sequence("dry-run", path, "--out", tmp_path)
+
+    assert status == 130
+    (fragment,) = tmp_path.glob("*-dark.toml")
+    assert f"written: {fragment}" in out
 
 
 @pytest.mark.parametrize("command", [["run", "dither"], ["end"]])
