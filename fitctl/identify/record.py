@@ -107,9 +107,8 @@ def gather(records: Iterable[Any], loop: str, name: str) -> ExperimentRecord:
         )
         raise IdentifyError(msg)
     table, tick = np.array(injected), tick_columns(ticks)
-    apart_s = np.diff(table[:, 0]), np.diff(tick["time_s"])
-    ascends = all(np.isfinite(apart).all() and (apart >= 0).all() for apart in apart_s)
-    if not (ascends and np.isfinite(table).all() and np.isfinite(tick["time_s"]).all()):
+    finite = all(np.isfinite(values).all() for values in (table, tick["time_s"]))
+    if not finite or any((np.diff(time_s) < 0).any() for time_s in (table[:, 0], tick["time_s"])):
         msg = (
             f"the experiment {name} on loop {loop} has times or voltages that are not finite, or times that "
             f"go back; expected those of one run; use its whole log, or run `fitctl identify {name}` again"

@@ -63,6 +63,10 @@ class Near(NamedTuple):
     broader: float
 
 
+ANYWHERE = Near(away_hz=math.inf, broader=1.0)
+"""As far and as broad as the periodograms show."""
+
+
 class Guess(NamedTuple):
     """A spectrum: air path, noise of a frame in px, gain and overshoot of the mirror, lines."""
 
@@ -102,12 +106,9 @@ class Likeliest:
 
 
 def likeliest(
-    opened: Opened, begin: Guess, *, free_mirror: bool = True, near: Near | None = None
+    opened: Opened, begin: Guess, *, free_mirror: bool = True, near: Near = ANYWHERE
 ) -> Likeliest:
-    """Search from a first guess; the number of lines stays, and the mirror if it is not free.
-
-    Lines may move and broaden as far as the periodograms show them, or no farther than `near`.
-    """
+    """Search from a first guess; the number of lines stays, and the mirror if it is not free."""
     problem = _Problem(opened, begin, free_mirror=free_mirror, near=near)
     values, cost = _lowest(problem)
     guess = problem.guess(values)
@@ -155,7 +156,7 @@ class _Problem:
         begin: Guess,
         *,
         free_mirror: bool = True,
-        near: Near | None = None,
+        near: Near = ANYWHERE,
     ) -> None:
         self.opened = opened
         self.axes = opened.disturbance.shape[1]
@@ -177,12 +178,9 @@ class _Problem:
         for line in begin.lines:
             width = math.log(max(line.half_width_hz, self.resolution_hz * _NARROWEST * 2))
             seen_hz = seen_at_hz(line.frequency_hz, 1 / opened.period_s)
-            widest_hz, farthest = BROADEST * seen_hz, _FARTHEST
-            if near is not None:
-                broader_hz = max(near.broader * line.half_width_hz, near.away_hz)
-                widest_hz = min(widest_hz, broader_hz)
-                farthest = min(farthest, near.away_hz / self.resolution_hz)
-            widest = math.log(widest_hz)
+            broader_hz = max(near.broader * line.half_width_hz, near.away_hz)
+            widest = math.log(min(BROADEST * seen_hz, broader_hz))
+            farthest = min(_FARTHEST, near.away_hz / self.resolution_hz)
             to_end_hz = 0.5 / opened.period_s - seen_hz
             # The search may not move an alias past a multiple of half the frame rate.
             is_alias = line.frequency_hz > seen_hz

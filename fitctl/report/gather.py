@@ -235,8 +235,7 @@ def _room(run: Run, topic: str, wanted: dict[str, Any]) -> Columns:
 
 def _fill(room: Columns, at: int, columns: Columns, time_s: NDArray[np.float64], path: str) -> int:
     """Put a block of ticks into their room, from row `at` on; returns how many rows there was room for."""
-    missing = [name for name in room if name not in columns and name not in LATER_FIELDS]
-    _require(missing, columns, dict.fromkeys(room, _NUMBERS), "ticks", path)
+    _require(columns, dict.fromkeys(room, _NUMBERS), LATER_FIELDS, "ticks", path)
     block = columns | {"time_s": time_s}
     if "mid_exposure_s" in room:
         block["mid_exposure_s"] = columns["mid_exposure_s"] + (time_s - columns["time_s"])
@@ -245,26 +244,25 @@ def _fill(room: Columns, at: int, columns: Columns, time_s: NDArray[np.float64],
     )  # a log in the making has grown since it was counted
     for name, column in room.items():
         values = block[name][:rows] if name in block else LATER_FIELDS[name]
-        if name == "mode_number":  # of a foreign log, perhaps too large for its column
-            values = np.clip(values, -1, np.iinfo(column.dtype).max)
+        if column.dtype.kind == "i":  # of a foreign log, perhaps too large for its column
+            values = np.clip(values, np.iinfo(column.dtype).min, np.iinfo(column.dtype).max)
         column[at : at + rows] = values
     return rows
 
 
 def _whole(name: str, columns: Columns, path: str) -> Columns:
     """A block of records with the fields that logs of earlier versions lack, each as its default."""
-    fields = _FIELDS[name]
-    missing = [each for each in fields if each not in columns and each not in _DEFAULTS[name]]
-    _require(missing, columns, fields, f"records of {name}", path)
+    _require(columns, _FIELDS[name], _DEFAULTS[name], f"records of {name}", path)
     rows = len(columns["publish_time_ns"])
     filled = {each: np.full(rows, default) for each, default in _DEFAULTS[name].items()}
     return filled | columns
 
 
 def _require(
-    missing: list[str], columns: Columns, kinds: dict[str, str], what: str, path: str
+    columns: Columns, kinds: dict[str, str], defaults: dict[str, Any], what: str, path: str
 ) -> None:
-    """Refuse columns that are missing, and those that hold values of another kind."""
+    """Refuse columns that are missing and have no default, and those that hold values of another kind."""
+    missing = [name for name in kinds if name not in columns and name not in defaults]
     if missing:
         msg = f"{path}: its {what} lack {', '.join(missing)}; it was recorded by another version of fitctl"
         raise LogError(msg)
