@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -23,6 +24,12 @@ WITH_US = ("--parent-pid", os.getpid())  # they end when the tests are killed
 # In a shell's background it is ignored, also by children.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 NEAR = "plant.loops.right.star_offset_sky_arcsec_max=5.0"  # found at once
+
+OWN_NAMES = """
+import os
+from fitctl.messages import endpoints
+endpoints.supervisor_names = lambda: os.environ["TEST_SUPERVISOR_NAMES"]
+"""
 
 
 def fitctl(*arguments, before=(), **options):
@@ -208,3 +215,38 @@ def running(folder, *settings, file=None, kind=Rig, before=(), mocks=()):
 def rig(tmp_path):
     with running(tmp_path) as rig:
         yield rig
+
+
+@pytest.fixture
+def own_names(tmp_path):
+    """What goes before a command line, so that it knows this test's supervisors and no others."""
+    folder = tmp_path / "own_names"
+    folder.mkdir()
+    (folder / "sitecustomize.py").write_text(OWN_NAMES)
+    names = f"fitctl-test:{os.getpid()}:{time.monotonic_ns()}:"
+    return ["env", f"PYTHONPATH={folder}", f"TEST_SUPERVISOR_NAMES={names}"]
+
+
+@pytest.fixture
+def said(own_names):
+    """Exit status, output and error output of a command."""
+
+    def run(*arguments):
+        done = subprocess.run(
+            [*own_names, sys.executable, "-m", "fitctl", *arguments],
+            capture_output=True,
+            text=True,
+            timeout=START_S,
+            check=False,
+        )
+        return done.returncode, done.stdout, done.stderr
+
+    return run
+
+
+@pytest.fixture
+def sockets():
+    """A folder for sockets of a demo; those that the rig file names, only one demo of the machine has."""
+    folder = Path(f"/tmp/fitctl-test-{os.getpid()}-{time.monotonic_ns()}")
+    yield folder
+    shutil.rmtree(folder, ignore_errors=True)

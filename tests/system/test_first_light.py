@@ -3,11 +3,9 @@
 import json
 import os
 import select
-import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -20,7 +18,7 @@ from fitctl.messages.client import Client
 from fitctl.messages.commands import Recover, Shutdown
 from fitctl.messages.waiting import wait_for_end
 
-from .conftest import START_S, Rig, child, end, fitctl, nothing_was_lost_without_a_stall
+from .conftest import START_S, child, end, fitctl, nothing_was_lost_without_a_stall
 
 pytestmark = pytest.mark.timeout(300)
 SUMMARY_KEYS = {
@@ -36,14 +34,17 @@ SUMMARY_KEYS = {
 }
 
 
-def demo(tmp_path, *arguments):
+def folders(tmp_path, sockets):
+    return ("--set", f"logging.folder={tmp_path}", "--set", f"service.folder={sockets}")
+
+
+def demo(tmp_path, sockets, *arguments):
     """Run a headless demo; returns its summary."""
     process = fitctl(
         "demo",
         "--headless",
         "--json",
-        "--set",
-        f"logging.folder={tmp_path}",
+        *folders(tmp_path, sockets),
         *arguments,
         stdout=subprocess.PIPE,
     )
@@ -52,21 +53,20 @@ def demo(tmp_path, *arguments):
     return json.loads(output.splitlines()[-1])
 
 
-def quiet_demo(tmp_path):
-    """Start a demo that is to be interrupted; all its files are below `tmp_path`."""
+def quiet_demo(tmp_path, sockets):
+    """Start a demo that is to be interrupted; all its files but the sockets are below `tmp_path`."""
     return fitctl(
         "demo",
         "--headless",
-        "--set",
-        f"logging.folder={tmp_path}",
+        *folders(tmp_path, sockets),
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         env=os.environ | {"TMPDIR": str(tmp_path)},
     )
 
 
-def test_the_demo_acquires_holds_and_sums_up(tmp_path):
-    summary = demo(tmp_path, "--duration", 35, "--seed", 3)
+def test_the_demo_acquires_holds_and_sums_up(tmp_path, sockets):
+    summary = demo(tmp_path, sockets, "--duration", 35, "--seed", 3)
 
     assert summary.keys() >= SUMMARY_KEYS
     assert summary["acquired_s"] < summary["vernier_s"] < 30
@@ -78,8 +78,8 @@ def test_the_demo_acquires_holds_and_sums_up(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(10))
-def test_ten_demos_of_a_minute(tmp_path, seed):
-    summary = demo(tmp_path, "--duration", 60, "--seed", seed)
+def test_ten_demos_of_a_minute(tmp_path, sockets, seed):
+    summary = demo(tmp_path, sockets, "--duration", 60, "--seed", seed)
 
     print(json.dumps(summary))
     assert summary["vernier_s"] < 30
@@ -121,7 +121,9 @@ def errors(seen):
     return [event for t in seen for event in t.events if event.severity == "error"]
 
 
-def test_a_demo_that_ends_without_its_star_says_so_by_its_status_and_names_its_log(tmp_path):
+def test_a_demo_that_ends_without_its_star_says_so_by_its_status_and_names_its_log(
+    tmp_path, sockets
+):
     """Also where its recorder is still being started at its end."""
     process = fitctl(
         "demo",
@@ -129,8 +131,7 @@ def test_a_demo_that_ends_without_its_star_says_so_by_its_status_and_names_its_l
         "--json",
         "--duration",
         1,
-        "--set",
-        f"logging.folder={tmp_path}",
+        *folders(tmp_path, sockets),
         stdout=subprocess.PIPE,
     )
     recorder = child(process.pid, "record")
@@ -145,35 +146,12 @@ def test_a_demo_that_ends_without_its_star_says_so_by_its_status_and_names_its_l
     assert Path(summary["log"]).parent == tmp_path
 
 
-def test_other_commands_find_a_running_demo_and_a_second_keeps_out_of_its_way(tmp_path):
-    rig = Rig(tmp_path)
-
-    def demo_of_it(*arguments):
-        return fitctl("demo", "--headless", *rig.common, *arguments, stdout=subprocess.PIPE)
-
-    try:
-        rig.supervisor, rig.client = demo_of_it(), Client(rig.sockets)
-        rig.follow_to("ACQUISITION")
-        second = demo_of_it("--duration", 3)
-        second.communicate(timeout=60)
-        assert second.returncode == 1  # it ran, and had no time for its star
-
-        status = fitctl("send", "status", *rig.common, stdout=subprocess.PIPE)
-        assert status.communicate(timeout=30)[0].startswith("right ")
-        assert status.returncode == 0
-    finally:
-        rig.close()
-
-
 @contextmanager
-def demo_on_a_terminal(tmp_path, *settings):
+def demo_on_a_terminal(tmp_path, sockets):
     """A demo with a console, and the other side of its terminal."""
     ours, theirs = os.openpty()
     process = subprocess.Popen(
-        [
-            *(sys.executable, "-m", "fitctl", "demo"),
-            *(part for s in (f"logging.folder={tmp_path}", *settings) for part in ("--set", s)),
-        ],
+        [sys.executable, "-m", "fitctl", "demo", *folders(tmp_path, sockets)],
         stdin=theirs,
         stdout=theirs,
         stderr=theirs,
@@ -188,16 +166,16 @@ def demo_on_a_terminal(tmp_path, *settings):
         os.close(ours)
 
 
-def test_on_a_terminal_the_demo_shows_its_instrument_and_ends_with_q(tmp_path):
-    with demo_on_a_terminal(tmp_path) as (process, terminal):
+def test_on_a_terminal_the_demo_shows_its_instrument_and_ends_with_q(tmp_path, sockets):
+    with demo_on_a_terminal(tmp_path, sockets) as (process, terminal):
         assert "live" in shown_until("live", terminal)
         os.write(terminal, b"q")
         assert f"log: {tmp_path}" in shown_until("log: ", terminal)
         assert process.wait(30) == 0
 
 
-def test_a_demo_that_is_left_before_its_recorder_has_begun_still_names_its_log(tmp_path):
-    with demo_on_a_terminal(tmp_path) as (process, terminal):
+def test_a_demo_that_is_left_before_its_recorder_has_begun_still_names_its_log(tmp_path, sockets):
+    with demo_on_a_terminal(tmp_path, sockets) as (process, terminal):
         recorder = child(process.pid, "record")
         recorder.suspend()
         assert "live" in shown_until("live", terminal)
@@ -210,10 +188,8 @@ def test_a_demo_that_is_left_before_its_recorder_has_begun_still_names_its_log(t
         assert process.wait(30) == 0
 
 
-def test_a_demo_whose_supervisor_was_shut_down_still_names_its_log(tmp_path):
-    """In sockets of its own, so that no other demo has them."""
-    sockets = Path(tempfile.mkdtemp(prefix="fitctl-test-"))
-    with demo_on_a_terminal(tmp_path, f"service.folder={sockets}") as (_, terminal):
+def test_a_demo_whose_supervisor_was_shut_down_still_names_its_log(tmp_path, sockets):
+    with demo_on_a_terminal(tmp_path, sockets) as (_, terminal):
         assert "live" in shown_until("live", terminal)
         client = Client(sockets)
         while (seen := client.receive(START_S)).loops[0].mode != "VERNIER":
@@ -223,7 +199,6 @@ def test_a_demo_whose_supervisor_was_shut_down_still_names_its_log(tmp_path):
         client.close()
         os.write(terminal, b"q")
         assert f"log: {tmp_path}" in shown_until("log: ", terminal)
-    shutil.rmtree(sockets, ignore_errors=True)
 
 
 def shown_until(text, terminal, limit_s=60.0):
@@ -238,8 +213,8 @@ def shown_until(text, terminal, limit_s=60.0):
 
 
 @pytest.mark.parametrize("after_s", [0.3, 0.8, 1.5, 2.2])
-def test_interrupting_a_demo_while_it_starts_leaves_nothing_behind(tmp_path, after_s):
-    process = quiet_demo(tmp_path)
+def test_interrupting_a_demo_while_it_starts_leaves_nothing_behind(tmp_path, sockets, after_s):
+    process = quiet_demo(tmp_path, sockets)
     psutil.wait_procs([psutil.Process(process.pid)], timeout=after_s)
     end(process, signal.SIGINT, timeout_s=40)
 
@@ -295,8 +270,8 @@ def test_send_gives_commands_from_a_shell(rig):
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_interrupting_a_demo_leaves_nothing_behind(tmp_path, number):
-    process = quiet_demo(tmp_path)
+def test_interrupting_a_demo_leaves_nothing_behind(tmp_path, sockets, number):
+    process = quiet_demo(tmp_path, sockets)
     family = wait_for_family(process, 3)
     end(process, number, timeout_s=40)
 
@@ -305,8 +280,8 @@ def test_interrupting_a_demo_leaves_nothing_behind(tmp_path, number):
     assert not list(tmp_path.glob("fitctl-demo-*"))
 
 
-def test_a_demo_killed_outright_takes_its_processes_with_it(tmp_path):
-    process = quiet_demo(tmp_path)
+def test_a_demo_killed_outright_takes_its_processes_with_it(tmp_path, sockets):
+    process = quiet_demo(tmp_path, sockets)
     family = wait_for_family(process, 3)
     process.kill()
     process.wait()
