@@ -112,7 +112,7 @@ def classifying_rate(frequencies_hz: Sequence[float], rate_hz: float) -> float:
 
     def nearest_hz(rate: float) -> float:
         places = [_places_hz(hz, rate_hz, rate * rate_hz, _MORE_MULTIPLES) for hz in frequencies_hz]
-        aliases = [hz for _, *others in places for hz in others]
+        aliases = [hz for slow, *others in places for hz in others if hz != slow]
         return min(abs(hz - away) for hz in aliases for away in (0.0, *(one[0] for one in places)))
 
     return rate_hz * max(OTHER_RATES, key=nearest_hz)
@@ -232,7 +232,7 @@ def _shown(
         differ = [
             place
             for place, hz in enumerate(places_hz[line])
-            if place != best and (0 in (place, best) or not _look_alike(hz, true_hz, others))
+            if hz != true_hz and (0 in (place, best) or not _look_alike(hz, true_hz, others))
         ]
         otherwise = min(differ, key=each.__getitem__)
         else_hz = places_hz[line][otherwise if best == 0 else 0]
@@ -273,11 +273,18 @@ def _places_hz(
 
 
 def _true_hz(line_hz: float, rate_hz: float, multiples: int = _MULTIPLES) -> list[float]:
-    """Where a line may be that is seen at `line_hz`: first if it is no alias."""
-    return [line_hz] + [
+    """Where a line may be that is seen at `line_hz`: first if it is no alias.
+
+    Beside half the frame rate, a line and its slowest alias are the same vibration.
+    """
+    aliases_hz = (
         multiple * rate_hz + side * line_hz
         for multiple in range(1, multiples + 1)
         for side in (-1, 1)
+    )
+    return [
+        line_hz,
+        *(line_hz if abs(hz - line_hz) <= SAME_LINE_HZ else hz for hz in aliases_hz),
     ]
 
 
