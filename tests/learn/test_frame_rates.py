@@ -150,6 +150,14 @@ def test_a_line_that_moves_is_an_alias_even_if_two_look_the_same(paper, fixed):
     assert line.is_alias
 
 
+def test_a_line_at_half_the_rate_is_no_alias_of_itself(paper, fixed):
+    """24.96 and 25.04 Hz look the same at every rate, and are the same to the mirror."""
+    truth = dataclasses.replace(paper, lines=(Line(24.96, 0.005, 0.05),))
+    (line,) = classified(paper, fixed, truth, truth, classifying_rate([24.96], RATE_HZ))
+
+    assert not line.is_alias
+
+
 @pytest.mark.parametrize("hz", [1.3, pytest.param(9.0, marks=pytest.mark.long)])
 def test_a_line_that_is_not_there_at_the_other_rate_is_not_classified(paper, fixed, hz):
     """A narrow line fades by itself."""
