@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import tomlkit
 
 from fitctl.commissioning.outcome import BEFORE, Cable, Outcome, Site, StepError, nobody_there
+from fitctl.commissioning.page import flat
 from fitctl.commissioning.record import Commissioning, Entry, Files, save
 from fitctl.commissioning.tasks import Task, tasks_of
 from fitctl.config import ConfigError, Rig, load_rig
@@ -60,14 +63,14 @@ class Course(NamedTuple):
         """Tasks that must be done before this one, and are not."""
         return [name for name in task.needs() if not self.record.done(name)]
 
-    def site(self, task: Task, rig: Rig) -> Site:
-        """What a task works on."""
+    def site(self, task: Task, rig: Rig, found: dict[str, Any] | None = None) -> Site:
+        """What a task works on; `found` is what the commissioned rig file has, and counts above ``--set``."""
         return Site(
             rig,
             task.loop,
             self.report,
             self.files.rig,
-            self.overrides,
+            self.overrides + (_settings(found or {}) if self.overrides else ()),
             self.record.figures(),
             quick=self.quick,
             cable=self.cable,
@@ -97,10 +100,10 @@ def _done(course: Course, task: Task) -> Entry:
     found: dict[str, object] = {}
     lines: list[str] = []
     first: dict[str, float] = {}
-    rig = course.rig(task.name)
-    course.files.write_rig(course.record.found(task.name, course.order))
+    before = course.record.found(task.name, course.order)
+    rig = _written(course, before)
     for attempt in range(_TRIES):
-        outcome = _attempt(course.site(task, rig), task)
+        outcome = _attempt(course.site(task, rig, before), task)
         lines += outcome.lines
         if outcome.trouble or not outcome.found:
             break
@@ -108,7 +111,8 @@ def _done(course: Course, task: Task) -> Entry:
         first = first or {f"{name}{BEFORE}": value for name, value in outcome.figures.items()}
         outcome = replace(outcome, found=found)
         try:
-            rig = _corrected(course, task, found)
+            lay_over(before, found)
+            rig = _written(course, before)
         except ConfigError as error:
             what = (
                 f"with what was found, the rig file contradicts itself: {error}; correct it by hand"
@@ -161,14 +165,33 @@ def _attempt(site: Site, task: Task) -> Outcome:
         return Outcome(trouble=str(error))
 
 
-def _corrected(course: Course, task: Task, found: dict[str, object]) -> Rig:
+def _written(course: Course, found: dict[str, Any]) -> Rig:
+    """The rig with what was found, of which the commissioned rig file is written.
+
+    Raises
+    ------
+    ConfigError
+        If it contradicts itself; the file stays as it was.
+    """
     laid = read_parts(course.rig_path, course.overrides)
-    before = course.record.found(task.name, course.order)
-    lay_over(before, found)
-    lay_over(laid.document, before)
+    lay_over(laid.document, found)
     rig = rig_from_parts(laid, str(course.rig_path))
-    course.files.write_rig(before)
+    course.files.write_rig(found)
     return rig
+
+
+def _settings(found: dict[str, Any]) -> tuple[str, ...]:
+    """A fragment of a rig file as values for ``--set``."""
+    return tuple(f"{key}={_inline(value)}" for key, value in flat(found).items())
+
+
+def _inline(value: object) -> str:
+    """A value in TOML on one line."""
+    if isinstance(value, Mapping):
+        return f"{{{', '.join(f'{key} = {_inline(part)}' for key, part in value.items())}}}"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_inline, value))}]"
+    return tomlkit.item(value).as_string()
 
 
 def chosen(tasks: Sequence[Task], only: Sequence[str]) -> list[Task]:

@@ -84,6 +84,28 @@ def test_an_estimate_is_taken_without_a_second_measurement(course, table):
     assert do(course, task(course, "later")).figures == {"gear": 26.0}
 
 
+def test_what_was_found_counts_above_what_set_says_also_for_processes_of_a_step(course, table):
+    spots = [{"name": "fringe", "offset_px": {"az": 9.0, "el": -1.5}, "flux_dn": 400.0}]
+    found = {"loops": {"right": GEAR["loops"]["right"] | {"other_spots": spots}}}
+    table(
+        gear=step(lambda _site: Outcome(found=found, estimated=True)),
+        later=step(
+            lambda site: started.append(load_rig(site.rig_path, site.overrides)) or Outcome()
+        ),
+    )
+    started = []
+    course = course._replace(
+        overrides=("loops.right.siderostat.spur_gear_ratio=24.0", "loops.right.star_flux_dn=999.0")
+    )
+    for name in ("gear", "later"):
+        do(course, task(course, name))
+    (rig,) = started
+
+    assert rig.loops["right"].siderostat.spur_gear_ratio == 26.0
+    assert rig.loops["right"].other_spots[0].offset_px.el == -1.5
+    assert rig.loops["right"].star_flux_dn == 999.0
+
+
 def test_a_correction_that_helps_nothing_fails(course, table):
     table(gear=step(lambda _site: Outcome(found=GEAR)))
     entry = do(course, task(course, "gear"))
