@@ -80,23 +80,20 @@ def check_star(site: Site) -> Outcome:
         seen = Watch(site, camera, None)
         spots = seen.spots()
         moved_rad, looks = 0.0, 0
+        at_px = spots[0].position_px if spots else np.zeros(2)
         if stars > 1 or not spots or seen.beside(spots[0]):
             with powered(site) as motors:
                 watch = Watch(site, camera, motors)
-                if stars == 1:
-                    _, looks = search(site, watch)
-                elif not _moves_a_star(watch):
-                    _, looks = search(site, watch, spots)
-                else:
-                    to_the_star(site, watch, _first(watch.spots()))
-                spots = watch.spots()
+                star, looks = own_star(site, watch, spots)
+                spots, at_px = watch.spots(), star.position_px
                 moved_rad = motors.furthest_rad
     if not spots:
         msg = "a spot appeared once and disappeared; repeat the step"
         raise StepError(msg)
     loop = site.loop
+    flux_dn = _nearest(spots, at_px).flux_dn
     figures = {
-        "flux_dn": spots[0].flux_dn,
+        "flux_dn": flux_dn,
         "spots": float(len(spots)),
         "looks": float(looks),
         "furthest_rad": moved_rad,
@@ -111,28 +108,48 @@ def check_star(site: Site) -> Outcome:
         msg = f"{number} spots could be the star, of {lights} DN; cover the other star, and repeat the step"
         raise StepError(msg, figures)
     low_dn, high_dn = loop.flux_range_dn
-    if low_dn <= spots[0].flux_dn <= high_dn:
+    if low_dn <= flux_dn <= high_dn:
         return Outcome(lines, figures)
-    part = spots[0].flux_dn / loop.star_flux_dn
+    part = flux_dn / loop.star_flux_dn
     other = [
         spot.model_dump() | {"flux_dn": round(spot.flux_dn * part, 1)} for spot in loop.other_spots
     ]
     lines.append(
         f"the star has {part:.2f} of star_flux_dn; the same factor is assumed for its other spots"
     )
-    return Outcome(
-        lines, figures, site.found(star_flux_dn=round(spots[0].flux_dn, 1), other_spots=other)
-    )
+    return Outcome(lines, figures, site.found(star_flux_dn=round(flux_dn, 1), other_spots=other))
 
 
-def _moves_a_star(watch: Watch) -> bool:
-    """Whether one of the stars on the camera moves with azimuth, which is back where it was afterwards."""
+def own_star(site: Site, watch: Watch, spots: list[Star]) -> tuple[Star, int]:
+    """The loop's own star among the spots that were seen, or brought onto the frame after some looks.
+
+    Raises
+    ------
+    StepError
+        If there is none.
+    """
+    if len(site.rig.stellar_loops) == 1:
+        return search(site, watch)
+    moved_px = _moved_px(watch)
+    if moved_px is None:
+        return search(site, watch, spots)
+    return to_the_star(site, watch, _nearest(watch.spots(), moved_px)), 0
+
+
+def _moved_px(watch: Watch) -> Floats | None:
+    """Where the one star is that moves with azimuth, which is back where it was afterwards."""
     start_rad = watch.goal_rad.copy()
     before = watch.places_px()
     watch.turn_to(start_rad + np.array([ROUGH_RAD, 0.0]))
     after = watch.places_px()
     watch.turn_to(start_rad)
-    return displaced(before, after) is not None
+    moved = displaced(before, after)
+    return None if moved is None else moved[0]
+
+
+def _nearest(spots: list[Star], place_px: Floats) -> Star:
+    _first(spots)
+    return min(spots, key=lambda spot: float(np.linalg.norm(spot.position_px - place_px)))
 
 
 def _bright(spots: list[Star]) -> int:

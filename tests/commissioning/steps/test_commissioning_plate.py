@@ -5,22 +5,27 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from commissioning.motor_bench import RIG, site_of
+from commissioning.motor_bench import RIG, BenchAmplifiers, site_of
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from fitctl.clock import VirtualClock
 from fitctl.commissioning.outcome import StepError
 from fitctl.commissioning.steps.mirror import _mirror_outcome
+from fitctl.commissioning.steps.motors import Motors
 from fitctl.commissioning.steps.plate import (
     _flipped,
     _refuse_meeting,
     _rough,
     _siderostat_outcome,
+    own_star,
     similar,
 )
-from fitctl.commissioning.steps.sky import square_spiral
+from fitctl.commissioning.steps.sky import Watch, square_spiral
+from fitctl.config import default_rig_path, load_rig
 from fitctl.config.wiring import AmplifierWiring
-from fitctl.model.optics import rotation
+from fitctl.controllers.centroid import Star
+from fitctl.model.optics import rotation, scales
 
 STRAIGHT = np.array([[0.0, 1.0], [1.0, -1.0], [-1.0, 0.0]])
 """Where stack 1, 2 and 3 move a star, in units of their stroke."""
@@ -139,3 +144,27 @@ def test_no_star_on_the_frame_is_one_clear_line():
     dark = SimpleNamespace(goal_rad=np.zeros(2), turn_to=lambda _: None, places_px=list)
     with pytest.raises(StepError, match="no star is on the frame any more"):
         _rough(site_of(), dark, 0)
+
+
+class TwoStars(Watch):
+    """A bright star of the other loop, and a dimmer one that this loop's motors move."""
+
+    def __init__(self, site, light):
+        self.bench = BenchAmplifiers(site.clock)
+        self.bench.enable()
+        super().__init__(site, None, Motors(self.bench, 0.002, site.clock))
+        self._px_of_a_rad = scales(site.rig, site.loop).motor_px_per_rad
+        self._light = light
+
+    def _spots(self, count):
+        az, el = np.array([12.0, 20.0]) + self._px_of_a_rad * self.bench.motor_rad
+        return [[Star(28.0, 20.0, 28000.0, 0, 0), Star(az, el, self._light, 0, 0)]] * count
+
+
+@pytest.mark.parametrize("light", [20000.0, 28000.0, 35000.0])
+def test_of_several_stars_the_one_that_moves_with_the_motors_is_the_loops_own(light):
+    site = site_of(load_rig(default_rig_path().parent / "two-stars.toml"), VirtualClock(), "left")
+    watch = TwoStars(site, light)
+    star, looks = own_star(site, watch, watch.spots())
+
+    assert (star.flux_dn, looks) == (light, 0)
