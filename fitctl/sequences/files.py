@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ def find_sequence(name: Path) -> Path:
     ConfigError
         If it is the old name of a shipped one.
     """
-    if name.exists() or name.parent != Path() or name.suffix:
+    if os.path.isfile(name) or name.parent != Path() or name.suffix:  # also for what is no path
         return name
     if str(name) in _RENAMED:
         msg = f"{name}: the shipped sequence {name} is now {_RENAMED[str(name)]}"
@@ -116,6 +117,9 @@ def _parse_csv(text: str, path: Path) -> list[tuple[str, Any]]:
         msg = f"{path}: is empty; its first line must name the columns"
         raise ConfigError(msg)
     (_, names), *rest = rows
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        msg = f"{path}: column {twice[0]} is there twice; give each column once"
+        raise ConfigError(msg)
     for number, row in rest:
         if len(row) != len(names):
             msg = f"{path}: line {number}: {len(row)} values for {len(names)} columns"
@@ -123,7 +127,12 @@ def _parse_csv(text: str, path: Path) -> list[tuple[str, Any]]:
     return [
         (
             f"{path}: line {number}",
-            {name: _number(text) for name, text in zip(names, row, strict=True) if text.strip()},
+            {
+                # A star may be called by a number, of which each digit counts.
+                name: text.strip() if name == "name" else _number(text)
+                for name, text in zip(names, row, strict=True)
+                if text.strip()
+            },
         )
         for number, row in rest
     ]

@@ -34,7 +34,7 @@ class SimulatedLink:
     ) -> None:
         self._stepping = threading.Lock()
         self._buffer = TelemetryBuffer()
-        self._period_s = 1.0 / rig.supervisor.telemetry_hz
+        self._period_s = self._due_in_s = 1.0 / rig.supervisor.telemetry_hz
         self._simulation = Simulation(
             rig, seed, record=self._buffer.add, history_s=1.0, advises=advises
         )
@@ -68,10 +68,13 @@ class SimulatedLink:
     def receive(self, timeout_s: float) -> Telemetry | None:
         """Go on until telemetry is due, or by `timeout_s`."""
         with self._stepping:
-            self._simulation.run(min(timeout_s, self._period_s))
+            run_s = min(timeout_s, self._due_in_s)
+            self._simulation.run(run_s)
             self._simulation.ticks.clear()  # which a run is evaluated by; nothing is here
-            if timeout_s < self._period_s:
+            self._due_in_s -= run_s
+            if self._due_in_s > 0:
                 return None
+            self._due_in_s = self._period_s
             self._state.sequence += 1
             return self._buffer.telemetry(self._simulation.supervisor, self._state, self.now_s())
 

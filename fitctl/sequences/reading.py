@@ -137,11 +137,8 @@ def read_stars(path: Path) -> list[Star]:
     """
     stars, wrong = [], []
     for where, row in read_table(path, "stars", "no such list of stars"):
-        named = row
-        if isinstance(row, dict) and isinstance(row.get("name"), float):
-            named = row | {"name": f"{row['name']:g}"}  # a star that is called by a number
         try:
-            stars.append(Star.model_validate(named))
+            stars.append(Star.model_validate(row))
         except ValidationError as error:
             wrong += [_mistake(where, Star, _key(each["loc"]), each) for each in error.errors()]
     if wrong:

@@ -128,7 +128,11 @@ class View:
     @property
     def loop(self) -> LoopState:
         """The loop's newest state."""
-        return next(loop for loop in self.telemetry.loops if loop.name == self.loop_name)
+        for loop in self.telemetry.loops:
+            if loop.name == self.loop_name:
+                return loop
+        msg = f"the supervisor has no loop {self.loop_name}; start it again with this rig file"
+        raise SequenceError(msg)
 
     @property
     def mode(self) -> Mode:

@@ -146,6 +146,29 @@ def test_a_star_that_is_let_go_fails_the_hold_and_the_next_attempt_says_why(trie
     assert "needs VERNIER" in run.attempts[2].message
 
 
+def test_a_hold_shorter_than_a_frame_is_judged_by_one_frame(tried):
+    run = tried()
+    run(ACQUIRE, {**HOLD, "duration_s": 0.005})
+
+    assert run.figures(1)["frames_seen"] == 1
+    assert run.figures(1)["rms_az_px"] < 0.1
+
+
+def test_a_sequence_goes_on_where_telemetry_is_slow(tried):
+    run = tried("supervisor.telemetry_hz=1.0")
+    run({"step": "standby"})
+
+    assert (run.outcomes(), run.error) == (["done"], "")
+
+
+def test_a_loop_that_the_supervisor_does_not_have_ends_the_sequence(tried):
+    run = tried()
+    run.rig = load_rig(default_rig_path().parent / "two-stars.toml")
+    run({"step": "standby", "loop": "left"})
+
+    assert "the supervisor has no loop left" in run.error
+
+
 def test_stop_ends_the_sequence_at_once_and_has_the_last_word(tried):
     run = tried()
     run.link.meddling = [(15.0, Stop())]

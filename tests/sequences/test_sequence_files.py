@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from fitctl.config import ConfigError, default_rig_path, load_rig
 from fitctl.sequences.behaviours.table import BEHAVIOURS
-from fitctl.sequences.files import parse_yaml, shipped_sequences
+from fitctl.sequences.files import find_sequence, parse_yaml, shipped_sequences
 from fitctl.sequences.reading import STEPS, load_sequence, sequence_from_document
 
 RIG = load_rig(default_rig_path())
@@ -281,3 +281,11 @@ def test_any_document_is_a_sequence_or_a_list_of_mistakes(document):
     assert all(line.startswith("any.toml: ") for line in mistakes_told)
     if sequence is not None:
         assert sequence_from_document(sequence.model_dump(), "again.toml") == sequence
+
+
+def test_a_folder_or_a_name_too_long_for_a_file_hides_no_shipped_sequence(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "dark").mkdir()
+
+    assert find_sequence(Path("dark")).is_file()
+    assert find_sequence(Path("a" * 300)) == Path("a" * 300)

@@ -85,6 +85,11 @@ class Behaviour(NamedTuple):
 POWERED = frozenset(set(Mode) - {Mode.OFF, Mode.SAFE})
 
 
+def frames_due(duration_s: float, rig: Rig) -> int:
+    """How many frames come in this time; at least one, or nothing would be measured."""
+    return max(1, round(duration_s * rig.camera.frame_rate_hz))
+
+
 def too_far(step: Moving, rig: Rig, loop_name: str, offset_px: float) -> list[str]:
     """What is wrong with moving the star by so much."""
     sky_arcsec = offset_px * scales(rig, rig.stellar_loops[loop_name]).sky_arcsec_per_px

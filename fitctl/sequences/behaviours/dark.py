@@ -15,6 +15,7 @@ from fitctl.sequences.view import Figures, StepFailed, View
 Floats = NDArray[np.float64]
 _BRIGHT_NOISES = 5.0  # above the bias, and a pixel is bright
 _MOST_NAMED = 20  # bad pixels that are named
+_ROUNDING_DN = 0.29  # what whole numbers have at least: a step over the root of twelve
 _NOISE_RANGE = (1 / 3, 3.0)  # of the median: a pixel that is stuck, or restless, is bad
 
 
@@ -64,7 +65,7 @@ def _calibration(rig: Rig, figures: Figures, dark_dn: Floats, message: str) -> C
     name = f"{rig.name}-dark.npy"
     camera = {
         "bias_dn": round(figures["bias_dn"], 2),
-        "pixel_noise_dn": round(figures["noise_dn"], 2),
+        "pixel_noise_dn": max(_ROUNDING_DN, round(figures["noise_dn"], 2)),
         "dark_file": name,
     }
     bad = [f"az {column}, el {row}" for row, column in np.argwhere(np.isnan(dark_dn))]

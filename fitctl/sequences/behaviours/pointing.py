@@ -14,7 +14,7 @@ from fitctl.messages.commands import SetTarget
 from fitctl.messages.modes import HOLDING, Mode
 from fitctl.model.optics import scales
 from fitctl.sequences import steps
-from fitctl.sequences.behaviours.behaviour import Behaviour, Result, too_far
+from fitctl.sequences.behaviours.behaviour import Behaviour, Result, frames_due, too_far
 from fitctl.sequences.view import Figures, Squares, StepFailed, View, columns
 
 Floats = NDArray[np.float64]
@@ -41,7 +41,7 @@ def _hold_done(step: steps.Hold, view: View) -> Result | None:
         raise StepFailed(msg)
     if of_beam:
         return _beam_held(step, view)
-    due = round(step.duration_s * view.rig.camera.frame_rate_hz)
+    due = frames_due(step.duration_s, view.rig)
     if view.elapsed_s > step.settle_s:
         view.squares.add(columns(view.measurements)[: due - view.squares.frames, 3:5])
     view.measurements.clear()  # hours of them would fill the memory
@@ -62,7 +62,7 @@ def _beam_held(step: steps.Hold, view: View) -> Result | None:
     if view.elapsed_s < step.settle_s + step.duration_s:
         return None
     samples = view.squares.with_star
-    if samples < _LEAST_SAMPLED * step.duration_s * view.rig.camera.frame_rate_hz:
+    if samples < max(1.0, _LEAST_SAMPLED * step.duration_s * view.rig.camera.frame_rate_hz):
         msg = f"the photodiodes gave {samples} samples in {step.duration_s:g} s; see fitctl status"
         raise StepFailed(msg)
     limit_arcsec = view.rig.metrology_loops[view.loop_name].requirement_arcsec
@@ -189,7 +189,7 @@ def _evaluate_visits(step: steps.Visiting, view: View, offsets: list[Offset]) ->
     time_s, star_px = table[:, 0], table[:, 1:3]
     limit_px = step.rms_limit_px or view.settings.requirement_px
     settled_s, overshoot_px, steady = [0.0], [0.0], []
-    due_each = round((step.dwell_s - step.steady_after_s) * view.rig.camera.frame_rate_hz)
+    due_each = frames_due(step.dwell_s - step.steady_after_s, view.rig)
     for came_s, offset in zip(view.marks, offsets, strict=True):
         there = (time_s >= came_s) & (time_s < came_s + step.dwell_s)
         away_px = star_px[there] - (target.az + offset.az_px, target.el + offset.el_px)

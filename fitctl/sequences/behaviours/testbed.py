@@ -11,7 +11,7 @@ from fitctl.messages.commands import MoveCollector
 from fitctl.messages.modes import Mode
 from fitctl.model.collector_motion import course_of
 from fitctl.sequences import steps
-from fitctl.sequences.behaviours.behaviour import POWERED, Behaviour, Result
+from fitctl.sequences.behaviours.behaviour import POWERED, Behaviour, Result, frames_due
 from fitctl.sequences.view import StepFailed, View
 
 _LEAST_HELD = 0.9  # of the frames that were due
@@ -87,14 +87,14 @@ def _stop_collector(step: steps.Collector, view: View) -> None:
 def _done_visibility(step: steps.Visibility, view: View) -> Result | None:
     view.measurements.clear()  # those of one star, which nothing evaluates here
     if view.elapsed_s > step.settle_s:
-        due = round(step.duration_s * view.rig.camera.frame_rate_hz) - view.squares.frames
+        due = frames_due(step.duration_s, view.rig) - view.squares.frames
         newest = [one for one in view.telemetry.overlaps if one.time_s >= view.began_s][:due]
         tilts_arcsec = [(one.tilt_az_arcsec, one.tilt_el_arcsec) for one in newest]
         view.squares.add(np.reshape(tilts_arcsec, (-1, 2)))
         view.marks += [one.visibility for one in newest]
     if view.elapsed_s < step.settle_s + step.duration_s:
         return None
-    due = round(step.duration_s * view.rig.camera.frame_rate_hz)
+    due = frames_due(step.duration_s, view.rig)
     visibility = np.array(view.marks)
     visibility = visibility[np.isfinite(visibility)]
     if visibility.size < _LEAST_HELD * due:

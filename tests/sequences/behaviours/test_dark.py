@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from fitctl import Instrument
 from fitctl.config import default_rig_path, load_rig
 from fitctl.messages.modes import Mode
-from fitctl.sequences.behaviours.dark import measure_dark
+from fitctl.sequences.behaviours.dark import _calibration, measure_dark
 from fitctl.simulation.batch.batch import Batch
 from fitctl.simulation.batch.settings import BatchRefusalError
 from fitctl.simulation.simulation import Simulation
@@ -41,6 +41,13 @@ def test_bias_and_noise_that_are_known_come_back(bias, noise, pattern, bright, s
     assert found["bright_pixels"] >= bright
     if pattern <= noise:
         assert found["bright_pixels"] == bright
+
+
+def test_a_camera_that_shows_no_noise_has_that_of_whole_numbers():
+    found = {"bias_dn": 20.0, "noise_dn": 0.0}
+    calibration = _calibration(load_rig(default_rig_path()), found, np.full((40, 40), 20.0), "")
+
+    assert calibration.fragment["camera"]["pixel_noise_dn"] == 0.29
 
 
 def test_a_camera_that_is_not_as_the_rig_file_says_is_found_out(tried):

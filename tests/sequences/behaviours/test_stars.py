@@ -162,6 +162,14 @@ def test_a_list_is_csv_toml_or_yaml(tmp_path, name):
     ]
 
 
+def test_a_star_that_is_called_by_a_number_keeps_each_digit(tmp_path):
+    path = tmp_path / "a.csv"
+    names = ["007", "1234567", "1234568", "5853498713190525696"]
+    path.write_text("\n".join(["name,az_sky_arcsec,el_sky_arcsec", *(f"{n},0,0" for n in names)]))
+
+    assert [star.name for star in read_stars(path)] == names
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -175,6 +183,10 @@ def test_a_list_is_csv_toml_or_yaml(tmp_path, name):
         ),
         ('name,az_sky_arcsec,el_sky_arcsec\n"a,1,2\n', "not CSV"),
         ("# nothing\n", "is empty; its first line must name the columns"),
+        (
+            "name,az_sky_arcsec,el_sky_arcsec,az_sky_arcsec\na,0,0,500\n",
+            "column az_sky_arcsec is there twice",
+        ),
     ],
 )
 def test_a_mistake_in_a_list_is_told_with_its_line(tmp_path, text, said):
