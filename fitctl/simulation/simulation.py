@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.clock import VirtualClock
-from fitctl.config import ARCSEC_PER_RAD, Rig
+from fitctl.config import ARCSEC_PER_RAD, ConfigError, Rig
 from fitctl.controllers.design.choose import design_for
 from fitctl.drivers.interface import Devices, LoopDevices
 from fitctl.learn.learner import Learner
@@ -206,9 +206,15 @@ class Simulation:
         ------
         RuntimeError
             If the supervisor refuses.
+        ConfigError
+            If the hexapod does: the motion of the rig file is beyond it.
         """
-        self._command(MoveCollector(action="reference"))
-        self._command(MoveCollector(action="start"))
+        for command in (MoveCollector(action="reference"), MoveCollector(action="start")):
+            self._command(command)
+            collector = self.supervisor.collector
+            if collector is not None and collector.error:
+                msg = f"collector.motion: {collector.error}"
+                raise ConfigError(msg)
 
     def _command(self, command: AnyCommand) -> None:
         reply = self.command(command)

@@ -112,6 +112,7 @@ BAD_INPUT = {
     ),
     "a rehearsal of what is no command": (["rehearse", "jog", "a", "1"], "rehearse: jog a 1: "),
     "a word that is no number": (["simulate", "--duration", "long"], "--duration"),
+    "more runs than anybody waits for": (["simulate", "--runs", "9" * 20], "--runs"),
     "an option without its value": (["console", "--log"], "fitctl console: Option '--log'"),
     "a controller that is none": (
         ["simulate", "--controller", "minvar"],

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from fitctl.config import ARCSEC_PER_RAD, default_rig_path, load_rig
+from fitctl.config import ARCSEC_PER_RAD, ConfigError, default_rig_path, load_rig
 from fitctl.controllers.visibility import visibility
 from fitctl.drivers.interface import DeviceRefused, Pose
 from fitctl.model.metrology.fringes import mean_visibility
@@ -61,6 +61,15 @@ def test_the_command_prints_loops_by_name_beside_what_they_have_in_common():
     assert list(printed["loops"]) == ["right", "metrology", "left"]
     assert set(printed["loops"]["left"]["rms_px"]) == {"az", "el"}
     assert set(printed["loops"]["metrology"]["rms_arcsec"]) == {"az", "el"}
+
+
+def test_a_collector_that_is_to_move_beyond_its_travel_is_bad_input():
+    """On one axis: the rig file's check allows the diagonal."""
+    too_far = ["collector.motion.kind=sine", "collector.motion.amplitude_mm=60.0"]
+    slowly = ["collector.motion.frequency_hz=0.01", "collector.motion.start_s=0.5"]
+
+    with pytest.raises(ConfigError, match=r"collector.motion: .* within -50 and 50"):
+        simulate_rig(load_rig(TESTBED, [*too_far, *slowly]), 0, 3.0)
 
 
 def test_a_seed_is_a_run():

@@ -20,7 +20,8 @@ from fitctl.commands.shared.options import (
 from fitctl.commands.shared.plant import require_plant
 from fitctl.commands.shared.printing import progress_line, say, say_lines, to_json
 from fitctl.commands.shared.rig import rig_of, with_controller
-from fitctl.config import Rig
+from fitctl.config import ConfigError, Rig
+from fitctl.drivers.interface import DeviceError
 from fitctl.messages.modes import Mode
 from fitctl.processes import ended_by_signals, interrupt
 from fitctl.simulation.campaign import (
@@ -47,7 +48,7 @@ def simulate(
         float, typer.Option(min=1.0, max=1e6, metavar="SECONDS", help="Virtual time.")
     ] = 120.0,
     runs: Annotated[
-        int, typer.Option(min=1, help="Number of runs, with seeds from --seed on.")
+        int, typer.Option(min=1, max=1_000_000, help="Number of runs, with seeds from --seed on.")
     ] = 1,
     scheduler: Annotated[
         str, typer.Option(metavar="ADDRESS", help="Run on a Dask cluster: tcp://host:port.")
@@ -71,9 +72,16 @@ def simulate(
 
 def _simulate_once(rig: Rig, seed: int, duration_s: float, *, as_json: bool) -> int:
     """Simulate and print the result; returns the exit status."""
-    with progress_line("simulating") as progress:
-        result = simulate_rig(rig, seed, duration_s, on_progress=progress)
-        progress(1.0)
+    try:
+        with progress_line("simulating") as progress:
+            result = simulate_rig(rig, seed, duration_s, on_progress=progress)
+            progress(1.0)
+    except DeviceError as error:  # which ended the collector's motion
+        say(f"simulate: {error}", err=True)
+        return FAILED
+    except MemoryError:
+        msg = f"simulate: --duration {duration_s:g} needs more memory than there is; choose a shorter one"
+        raise ConfigError(msg) from None
     loops = {name: loop._asdict() for name, loop in result.loops.items()}
     if as_json:
         several = result._asdict() | {"loops": loops}
