@@ -68,8 +68,8 @@ class _Rule:
             what = f"no {self.quantity} for {age_s:.3g} s"
         else:
             side = f"above {self.high:g}" if value > self.high else f"below {self.low:g}"
-            lasting = f" for {self.for_s:g} s" if self.for_s else ""
-            what = f"{self.quantity} {value:.4g} is {side}{lasting}"
+            out = "is not a number" if math.isnan(value) else f"{value:.4g} is {side}"
+            what = f"{self.quantity} {out}" + (f" for {self.for_s:g} s" if self.for_s else "")
         return f"interlock {self.name}: {self.place}: {what}; {QUANTITIES[self.quantity].remedy}"
 
 

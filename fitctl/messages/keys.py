@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import re
 import stat
+import struct
 import tempfile
 from contextlib import suppress
 from ipaddress import ip_address
@@ -18,6 +19,7 @@ from typing import Annotated, Literal, TypeVar
 
 import msgspec
 import zmq
+from zmq.utils import z85
 
 from fitctl.config import ConfigError, Rig
 from fitctl.files import open_regular
@@ -27,16 +29,29 @@ Role = Literal["commander", "viewer"]
 KeyText = Annotated[str, msgspec.Meta(pattern=r"^[!-~]{40}$")]  # Z85, 32 bytes
 Name = Annotated[str, msgspec.Meta(pattern=r"^[a-z0-9][a-z0-9_-]{0,31}$")]
 PortNumber = Annotated[int, msgspec.Meta(ge=1, le=65535)]
+_HOST = r"^[A-Za-z0-9:][A-Za-z0-9._:%-]*\Z"  # what libzmq connects to
 
 
-class KeyPair(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class _Keys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """Refuses what is no Z85 in its keys, which libzmq would refuse later."""
+
+    def __post_init__(self) -> None:
+        for field in {"public", "secret", "server_public"}.intersection(self.__struct_fields__):
+            try:
+                z85.decode(getattr(self, field))
+            except (ValueError, KeyError, struct.error):
+                msg = f"{field}: expected a key of 40 characters of Z85"
+                raise ValueError(msg) from None
+
+
+class KeyPair(_Keys, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A CURVE key pair, each as 40 characters of Z85."""
 
     public: KeyText
     secret: KeyText
 
 
-class AllowedKey(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class AllowedKey(_Keys, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A client that the server lets in."""
 
     name: Name
@@ -44,13 +59,13 @@ class AllowedKey(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_field
     public: KeyText
 
 
-class RemoteKey(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class RemoteKey(_Keys, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """All that a client needs to reach one rig."""
 
     rig: str
     name: Name
     role: Role
-    host: str
+    host: Annotated[str, msgspec.Meta(pattern=_HOST)]
     command_port: PortNumber
     telemetry_port: PortNumber
     server_public: KeyText
@@ -62,11 +77,23 @@ T = TypeVar("T", KeyPair, AllowedKey, RemoteKey)
 
 
 def keys_folder(rig: Rig) -> Path:
-    """Where the keys of a rig are."""
-    if rig.service.keys_folder:
-        return Path(rig.service.keys_folder).expanduser()
-    own = os.environ.get("XDG_CONFIG_HOME") or "~/.config"
-    return Path(own).expanduser() / "fitctl" / "keys" / rig.name
+    """Where the keys of a rig are.
+
+    Raises
+    ------
+    ConfigError
+        If no folder can have such a name.
+    """
+    given = rig.service.keys_folder
+    base = given or os.environ.get("XDG_CONFIG_HOME") or "~/.config"
+    try:
+        folder = Path(base).expanduser()
+        with suppress(OSError):
+            folder.stat()
+    except (RuntimeError, ValueError) as error:  # no such user; a NUL or half a character in it
+        msg = f"service.keys_folder: {base!r}: {error}; choose another"
+        raise ConfigError(msg) from None
+    return folder if given else folder / "fitctl" / "keys" / rig.name
 
 
 def server_pair(rig: Rig) -> KeyPair:
@@ -105,7 +132,7 @@ def new_key(rig: Rig, name: str, role: Role, host: str, out: Path) -> RemoteKey:
     """
     service = rig.service
     host = host or service.tcp_address
-    if not host or (_is_address(host) and ip_address(host).is_unspecified):
+    if not re.match(_HOST, host) or _is_unspecified(host):
         msg = (
             f"keys: a client cannot reach this machine at {host!r}; give its name or address with --host, "
             "or set service.tcp_address to one"
@@ -225,8 +252,11 @@ def _new_pair() -> KeyPair:
     return KeyPair(public=public.decode(), secret=secret.decode())
 
 
-def _is_address(text: str) -> bool:
-    return bool(re.fullmatch(r"[\d.]+|[\da-fA-F:]+", text))
+def _is_unspecified(host: str) -> bool:
+    try:
+        return ip_address(host).is_unspecified
+    except ValueError:
+        return False  # a name
 
 
 def _read(path: Path, kind: type[T]) -> T:

@@ -26,7 +26,7 @@ from prometheus_client.metrics_core import (
 from prometheus_client.registry import Collector
 
 from fitctl.config import ConfigError
-from fitctl.logging.records import DeviceHealth, LoopTiming, Overlap, Severity
+from fitctl.logging.records import DeviceHealth, LoopTiming, Overlap, Record, Severity
 from fitctl.messages.client import Client
 from fitctl.messages.modes import Mode
 from fitctl.messages.tally import BeamTally, Tally, add_beam_ticks, add_ticks
@@ -94,6 +94,11 @@ class InstrumentCollector(Collector):
             before = self._newest
             if before is not None and before.pid == telemetry.pid:
                 self._messages_missed += telemetry.sequence - before.sequence - 1
+            elif before is not None:  # another supervisor: what the last one measured is over
+                self._overlap = None
+                self._timings.clear()
+                for tally in self._tallies.values():
+                    tally.newest = None
             self._newest, self._received_s = telemetry, now_s
             add_ticks(self._tallies, telemetry.ticks)
             add_beam_ticks(self._beams, telemetry.metrology_ticks)
@@ -119,8 +124,8 @@ class InstrumentCollector(Collector):
             yield from _of_instrument(self._newest)
             yield from _of_loops(self._newest, self._tallies)
             yield from _of_beams(self._beams)
-            yield from _of_overlap(self._overlap)
-            yield from _of_timing(self._timings, self._timed)
+            yield from _of_overlap(self._newest, self._overlap)
+            yield from _of_timing(self._newest, self._timings, self._timed)
             yield from _of_devices(self._newest)
             yield _counters(
                 "fitctl_events",
@@ -227,6 +232,11 @@ def serve_metrics(client: Client, port: int, rig_name: str, stop: threading.Even
         thread.join()
 
 
+def _is_fresh(record: Record | None, newest: Telemetry) -> bool:
+    """Whether a record tells how it is now, and not how it was."""
+    return record is not None and newest.time_s - record.time_s <= STALE_S
+
+
 Rows = Iterable[tuple[list[str], float]]
 """Values of labels, and the value."""
 
@@ -298,7 +308,9 @@ def _of_loops(newest: Telemetry, tallies: dict[str, Tally]) -> Iterator[Metric]:
         ["loop"],
         [([loop.name], bool(loop.waits_for)) for loop in newest.loops],
     )
-    ticks = {loop: tally.newest for loop, tally in tallies.items()}
+    ticks = {
+        loop: tally.newest for loop, tally in tallies.items() if _is_fresh(tally.newest, newest)
+    }
     for name, text, field in OF_TICK:
         rows = [([loop], getattr(tick, field)) for loop, tick in ticks.items()]
         yield _gauges(name, text, ["loop"], rows)
@@ -335,8 +347,8 @@ def _of_beams(tallies: dict[str, BeamTally]) -> Iterator[Metric]:
     )
 
 
-def _of_overlap(newest: Overlap | None) -> Iterator[Metric]:
-    rows = [] if newest is None else [newest]
+def _of_overlap(newest: Telemetry, overlap: Overlap | None) -> Iterator[Metric]:
+    rows = [overlap] if overlap is not None and _is_fresh(overlap, newest) else []
     yield _gauges(
         "fitctl_tilt_arcseconds",
         "Tilt between two loops' stars on the newest frame.",
@@ -355,12 +367,17 @@ def _of_overlap(newest: Overlap | None) -> Iterator[Metric]:
     )
 
 
-def _of_timing(newest: dict[str, LoopTiming], sums: Counter[tuple[str, str]]) -> Iterator[Metric]:
+def _of_timing(
+    newest: Telemetry, timings: dict[str, LoopTiming], sums: Counter[tuple[str, str]]
+) -> Iterator[Metric]:
     for name, text, field in OF_TIMING:
-        rows = [([loop], getattr(row, field)) for loop, row in newest.items()]
+        rows = [
+            ([at], getattr(row, field)) for at, row in timings.items() if _is_fresh(row, newest)
+        ]
         yield _gauges(name, text, ["loop"], rows)
     for name, text, field in OF_TIMINGS:
-        yield _counters(name, text, ["loop"], [([loop], sums[field, loop]) for loop in newest])
+        totals = [([loop], total) for (of, loop), total in sums.items() if of == field]
+        yield _counters(name, text, ["loop"], totals)
 
 
 def _of_devices(newest: Telemetry) -> Iterator[Metric]:

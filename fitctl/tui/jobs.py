@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -9,9 +10,11 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
+from typing import Any
 
 END_WAIT_S = 3.0
 MOST_BYTES = 200_000
+MOST_JSON_BYTES = 8_000_000
 _ASKS = ": "  # at the end of a question
 GENTLY = ("nice", "-n", "10")  # a rehearsal or a report takes no time from the instrument
 
@@ -56,11 +59,11 @@ class Job:
         """Its exit status; None while it runs."""
         return self._process.poll()
 
-    def text(self) -> str:
-        """What it has printed so far; of very much, the end."""
+    def text(self, most_bytes: int = MOST_BYTES) -> str:
+        """What it has printed so far; of more than `most_bytes`, the end."""
         # Both have one place in the file: a read that moved it would have the child write over what it wrote.
         size = os.fstat(self._output.fileno()).st_size
-        read = os.pread(self._output.fileno(), MOST_BYTES, max(0, size - MOST_BYTES))
+        read = os.pread(self._output.fileno(), most_bytes, max(0, size - most_bytes))
         return read.decode(errors="replace")
 
     def question(self) -> str:
@@ -97,3 +100,21 @@ class Job:
         if self._process.stdin is not None:
             self._process.stdin.close()
         self._output.close()
+
+
+def printed_json(job: Job) -> Any:
+    """The JSON document that a job has printed.
+
+    Raises
+    ------
+    ValueError
+        If it has printed something else, or too much.
+    """
+    try:
+        return json.loads(job.text(MOST_JSON_BYTES))
+    except ValueError as error:
+        msg = (
+            f"{job.command_line}: cannot be shown: expected a JSON document of at most "
+            f"{MOST_JSON_BYTES // 1_000_000} MB, got something else ({error}); run it in a terminal"
+        )
+        raise ValueError(msg) from None

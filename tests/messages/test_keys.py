@@ -95,7 +95,41 @@ def test_a_name_is_never_a_path_nor_a_local_user(rig, tmp_path, name):
     assert not (tmp_path / "key.toml").exists()
 
 
-@pytest.mark.parametrize("host", ["0.0.0.0", "::"])
+@pytest.mark.parametrize("host", ["cafe", "1.2.3", "fe80::1%eth0", "fit-1.example"])
+def test_a_name_that_looks_like_an_address_is_a_name(rig, tmp_path, host):
+    new_key(rig, "anna", "commander", host, tmp_path / "anna.toml")
+
+    assert read_remote(tmp_path / "anna.toml").host == host
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ('host = "127.0.0.1"', 'host = "ho st"'),
+        ('host = "127.0.0.1"', 'host = "127.0.0.1\\n"'),
+        ("server_public", f'server_public = "{40 * "#"}"'),
+        ("secret", f'secret = "{40 * "~"}"'),
+    ],
+)
+def test_a_key_file_that_leads_nowhere_is_refused_by_name(rig, tmp_path, before, after):
+    path = tmp_path / "anna.toml"
+    new_key(rig, "anna", "commander", "", path)
+    lines = [after if line.startswith(before) else line for line in path.read_text().splitlines()]
+    path.write_text("\n".join(lines))
+
+    with pytest.raises(ConfigError, match=r"anna\.toml: is not a key file of fitctl: "):
+        read_remote(path)
+
+
+@pytest.mark.parametrize("folder", ["~nosuchuser/x", "a\0b"])
+def test_a_folder_of_keys_that_cannot_be_is_refused(rig, folder):
+    service = rig.service.model_copy(update={"keys_folder": folder})
+
+    with pytest.raises(ConfigError, match=r"service\.keys_folder: .*; choose another"):
+        keys_folder(rig.model_copy(update={"service": service}))
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "ho st", "-x", "a/b", "a\n"])
 def test_an_address_that_is_none_is_no_place_to_reach(rig, tmp_path, host):
     with pytest.raises(ConfigError, match="--host"):
         new_key(rig, "anna", "commander", host, tmp_path / "key.toml")

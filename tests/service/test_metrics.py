@@ -258,17 +258,9 @@ def test_the_beam_and_the_overlap_of_the_testbed_are_served():
     beam = dict.fromkeys(("beam_az_arcsec", "beam_el_arcsec"), 0.5)
     tick = metrology_tick(beam_state="MEASURED", **beam)
     dark = metrology_tick(beam_state="", beam_az_arcsec=math.nan, beam_el_arcsec=math.nan)
-    overlap = Overlap(
-        time_s=0.0,
-        loop="left",
-        other_loop="right",
-        number=1,
-        tilt_az_arcsec=0.1,
-        tilt_el_arcsec=-0.2,
-        visibility=0.97,
-    )
+    message = FakeSupervisor().message()
     message = msgspec.structs.replace(
-        FakeSupervisor().message(), metrology_ticks=[tick, dark, tick], overlaps=[overlap]
+        message, metrology_ticks=[tick, dark, tick], overlaps=[overlap_at(message.time_s)]
     )
     collector.accept(message, time.monotonic())
     values = {
@@ -287,3 +279,47 @@ def metrology_tick(**fields):
     nothing = {"int": 0, "float": 0.0, "str": "", "bool": False}
     values = {name: nothing[kind] for name, kind in MetrologyTick.__annotations__.items()}
     return MetrologyTick(time_s=0.0, **values | {"loop": "metrology"} | fields)
+
+
+def overlap_at(time_s):
+    return Overlap(
+        time_s=time_s,
+        loop="left",
+        other_loop="right",
+        number=1,
+        tilt_az_arcsec=0.1,
+        tilt_el_arcsec=-0.2,
+        visibility=0.97,
+    )
+
+
+def gauges_and_counters(collector):
+    """Names of all that has a value now."""
+    return {sample.name for family in collector.collect() for sample in family.samples}
+
+
+NEWEST = {
+    "fitctl_visibility",
+    "fitctl_tilt_arcseconds",
+    "fitctl_star_visible",
+    "fitctl_tick_compute_worst_seconds",
+}
+SUMS = {"fitctl_ticks_total", "fitctl_servo_periods_total"}
+
+
+@pytest.mark.parametrize(("pid", "later_s"), [(4242, 5.0), (4243, 0.1)], ids=["stop", "restart"])
+def test_what_was_measured_before_a_stop_or_a_restart_is_not_told_as_newest(pid, later_s):
+    collector, message = InstrumentCollector(), FakeSupervisor().message()
+    before = msgspec.structs.replace(message, overlaps=[overlap_at(message.time_s)])
+    collector.accept(before, time.monotonic())
+    assert gauges_and_counters(collector) >= NEWEST | SUMS
+
+    stopped = {"ticks": [], "timing": [], "overlaps": []}
+    after = msgspec.structs.replace(
+        message, pid=pid, sequence=2, time_s=message.time_s + later_s, **stopped
+    )
+    collector.accept(after, time.monotonic())
+
+    told = gauges_and_counters(collector)
+    assert not told & NEWEST
+    assert told >= SUMS

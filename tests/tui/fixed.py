@@ -142,7 +142,7 @@ class FakeJob:
     def interrupt(self):
         self.interrupted = True
 
-    def text(self):
+    def text(self, _most_bytes=0):
         if self.asks:
             return self.printed
         if self.arguments[:2] == ["commission", "--list"]:

@@ -1,12 +1,14 @@
 """Other fitctl commands as children: real processes."""
 
+import json
+import os
 import signal
 import sys
 import time
 
 import pytest
 
-from fitctl.tui.jobs import Job
+from fitctl.tui.jobs import MOST_BYTES, Job, printed_json
 
 LIMIT_S = 60.0
 
@@ -42,3 +44,18 @@ def test_a_job_is_ended_with_the_console_unless_it_is_to_outlive_it(tmp_path, mo
     assert job.status == -signal.SIGTERM
     other.end()
     assert finished(other) == 2
+
+
+def test_a_long_json_document_is_read_whole():
+    job = Job(["check", "no-such-rig.toml"])
+    finished(job)
+    document = json.dumps(["star"] * MOST_BYTES).encode()
+    os.ftruncate(job._output.fileno(), 0)
+    os.pwrite(job._output.fileno(), document, 0)
+    try:
+        assert printed_json(job) == ["star"] * MOST_BYTES
+        os.pwrite(job._output.fileno(), b"a warning", len(document))
+        with pytest.raises(ValueError, match=r"fitctl check no-such-rig.toml: cannot be shown: "):
+            printed_json(job)
+    finally:
+        job.end()

@@ -135,7 +135,7 @@ def loop_cell(state: ConsoleState, loop: LoopView, columns: int, names: int) -> 
         if width(line) + len(since) + width(condition) + 2 > columns:
             since, condition = "", _condition(state, loop, columns - width(line) - 2)
         line += [text(since, INK), text(" "), *condition]
-    return clickable(pad(line, columns), f"app.show_loop('{loop.state.name}')")
+    return clickable(pad(line, columns), f"app.show_loop({loop.state.name!r})")
 
 
 def _names(state: ConsoleState) -> int:

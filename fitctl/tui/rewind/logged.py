@@ -15,6 +15,7 @@ from typing import Any
 
 import msgspec
 
+from fitctl.config import is_name
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import LogMessage
 from fitctl.logging.records import (
@@ -310,7 +311,7 @@ def _state_of(snapshot: Snapshot) -> Unlogged | None:
 
 
 def _is_sound(loop: LoopState) -> bool:
-    """Whether a loop's scales and limits can be drawn."""
+    """Whether a loop has a proper name, and scales and limits that can be drawn."""
     scales = [loop.requirement_px, loop.sky_arcsec_per_px]
     limits = loop.limits
     if limits is not None:
@@ -318,7 +319,7 @@ def _is_sound(loop: LoopState) -> bool:
         scales += [limits.siderostat_travel_sky_arcsec, pitch_arcsec]
         scales.append(limits.search_radius_sky_arcsec / max(pitch_arcsec, SMALLEST))  # turns
         scales.append(limits.fsm_range_rad + 1.0)  # zero without a mirror
-    return all(SMALLEST < scale < LARGEST for scale in scales)
+    return is_name(loop.name) and all(SMALLEST < scale < LARGEST for scale in scales)
 
 
 def _all_bounded(value: Any) -> bool:

@@ -61,8 +61,9 @@ class Player:
     def _make(self, time_s: float) -> tuple[ConsoleState, AlarmBook] | str:
         try:
             moment = self.recording.at(time_s)
+            return "no data had arrived by then" if moment is None else state_of(moment, time_s)
         except LogError as error:
             return str(error)
-        if moment is None:
-            return "no data had arrived by then"
-        return state_of(moment, time_s)
+        except Exception as error:  # anyone may have written the log
+            why = f"{type(error).__name__}: {error}".partition("\n")[0]
+            return f"this moment cannot be shown: the recording has unexpected data ({why}); choose another"

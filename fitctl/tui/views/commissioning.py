@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import ClassVar
 
 from textual.app import ComposeResult
@@ -10,7 +9,7 @@ from textual.binding import BindingType
 
 from fitctl.tui.commands import keys_of
 from fitctl.tui.dialogs import Ask, Confirm
-from fitctl.tui.jobs import Job
+from fitctl.tui.jobs import Job, printed_json
 from fitctl.tui.steps import StepFacts, StepList
 from fitctl.tui.views.view import View
 from fitctl.tui.widgets.printed import Printed
@@ -90,7 +89,10 @@ class CommissioningView(View):
         self._list = None
         if job.status == 0:
             before = steps.next_name
-            steps.listed = json.loads(job.text())
+            try:
+                steps.listed = printed_json(job)
+            except ValueError as error:
+                self.notify(str(error), severity="error", timeout=8, markup=False)
             if steps.next_name != before:
                 steps.choose(steps.next_name)
         else:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import tempfile
 import tomllib
@@ -16,7 +15,7 @@ from textual.binding import BindingType
 from fitctl.messages.commands import SequenceControl
 from fitctl.tui.commands import keys_of
 from fitctl.tui.dialogs import Ask
-from fitctl.tui.jobs import Job
+from fitctl.tui.jobs import Job, printed_json
 from fitctl.tui.views.view import View
 from fitctl.tui.widgets.printed import Printed
 from fitctl.tui.widgets.sequencing import Estimates, Parameters, Progress, SequenceList
@@ -83,7 +82,10 @@ class SequencesView(View):
         self._list = None
         printed = self.query_one(Printed)
         if job.status == 0:
-            self._add(json.loads(job.text()))
+            try:
+                self._add(printed_json(job))
+            except ValueError as error:
+                self.notify(str(error), severity="error", timeout=8, markup=False)
             job.end()
         elif printed.moving is None:
             printed.show(job)  # it says why

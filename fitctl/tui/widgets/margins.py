@@ -66,7 +66,11 @@ class DesignFigures:
         if status != 0:
             self.problem = output.strip().splitlines()[-1] if output.strip() else "no answer"
             return
-        figures = json.loads(output.strip().splitlines()[-1])
+        try:
+            figures = json.loads(output.strip().rpartition("\n")[2])
+        except ValueError as error:
+            self.problem = f"fitctl design printed no JSON: {error}"
+            return
         if "stable" not in figures:
             # A supervisor elsewhere may name anything that the command knows, such as "bound".
             self.problem = f"{design.design} is not a design"

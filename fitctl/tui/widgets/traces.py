@@ -100,7 +100,7 @@ class Traces(Panel):
             text(f"{look.symbol} {loop.state.mode}", look.colour, bold=True),
         ]
         if loop.state.mode == "ACQUISITION":  # what a search passes over is no error of a star
-            return clickable(head, f"app.show_loop('{loop.state.name}')")
+            return clickable(head, f"app.show_loop({loop.state.name!r})")
         rms = present_rms(self.state, loop)
         requirement = unit.per_px * loop.state.requirement_px
         figures: Line = []
@@ -111,7 +111,7 @@ class Traces(Panel):
         if holds(loop) and not math.isnan(rms.az_px):
             good = max(rms.az_px, rms.el_px) <= loop.state.requirement_px
             figures += [text(" "), mark(good=good)]
-        return clickable(spread(head, figures, columns), f"app.show_loop('{loop.state.name}')")
+        return clickable(spread(head, figures, columns), f"app.show_loop({loop.state.name!r})")
 
     def _time_axis(self, columns: int) -> Line:
         """From the left end to now; of old data to how old they are, and of the past to its time."""

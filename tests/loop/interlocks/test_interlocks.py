@@ -97,6 +97,12 @@ def test_too_low_and_not_a_number_are_out_of_range(value):
     assert course.tripped == ["it"]
 
 
+def test_what_is_not_a_number_is_told_so():
+    (change,) = Course(table()).show([float("nan")] * 10)
+
+    assert "fsm_range_fraction is not a number for 0.1 s" in change.trip.reason
+
+
 def test_a_value_that_grows_old_is_out_of_range_and_says_so():
     course = Course(table(high=None, stale_s=0.2, for_s=0.0))
     course.show([0.5])

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import scipy.special
+from textual.actions import parse
 
 from fitctl.messages.telemetry import FringeOptics, Telemetry
 from fitctl.service.telemetry_buffer import ServiceState, TelemetryBuffer
@@ -256,6 +257,13 @@ def test_a_click_on_a_loop_chooses_it():
         assert app.state.shown == "left"
 
     run(scenario, supervisor=FakeSupervisor(loops=TESTBED))
+
+
+def test_a_click_names_the_loop_also_where_a_supervisor_names_it_oddly():
+    state = shown(FakeSupervisor(loops=("right", "it's")))
+    for lines in (loop_rows(state, 120), Traces(state).draw(80, 20)):
+        actions = {part.style.meta.get("@click") for line in lines for part in line if part.style}
+        assert {parse(action)[2] for action in actions if action} == {("right",), ("it's",)}
 
 
 def test_the_footer_says_which_loop_a_command_goes_to_and_that_stop_is_for_all():

@@ -1,11 +1,13 @@
 """`fitctl console --log`: every panel as it was, from a log that anyone may have written."""
 
 import asyncio
+import queue
 import random
 from pathlib import Path
 
 import msgspec
 import pytest
+from msgspec.structs import replace
 
 from fitctl.commands.operate import console
 from fitctl.commands.operate.logged_loops import loops_at_start
@@ -13,6 +15,7 @@ from fitctl.config import ConfigError, default_rig_path, load_rig
 from fitctl.logging.errors import LogError
 from fitctl.logging.records import RunInfo, Snapshot
 from fitctl.logging.writer import LogWriter
+from fitctl.messages.telemetry import LoopFailure
 from fitctl.tui.alarms import notes
 from fitctl.tui.app import ConsoleApp
 from fitctl.tui.commands import VIEWS
@@ -20,6 +23,7 @@ from fitctl.tui.loops.fringes import fringe_line
 from fitctl.tui.rewind import logged as logged_module
 from fitctl.tui.rewind.logged import LoggedRun
 from fitctl.tui.rewind.moment import state_of
+from fitctl.tui.rewind.player import Player
 from fitctl.tui.state import ConsoleState
 from fitctl.tui.widgets.events import Events
 from fitctl.tui.widgets.focalplane import FocalPlane
@@ -318,3 +322,34 @@ def test_a_log_is_shown_from_this_machine_in_this_terminal(options):
 def test_a_log_that_cannot_be_read_is_named_before_the_console_opens(tmp_path):
     with pytest.raises(ConfigError, match=r"none\.mcap: cannot be opened"):
         console._show_log(tmp_path / "none.mcap", None, "auto", web=False)
+
+
+def with_states(messages, change):
+    """The same telemetry with other states of its loops."""
+    return [
+        msgspec.structs.replace(message, loops=[change(loop) for loop in message.loops])
+        for message in messages
+    ]
+
+
+def test_a_moment_that_cannot_be_shown_is_told_and_the_next_one_is_shown(tmp_path):
+    failure = LoopFailure(time_s=float("nan"), what="acquire", text="no star")
+    messages = FakeSupervisor().messages(100)
+    broken = with_states(messages[50:], lambda loop: replace(loop, last_failure=failure))
+    path = write_log(tmp_path / "log.mcap", [*messages[:50], *broken])
+    made = queue.Queue()
+    player = Player(LoggedRun(path, loops_at_start), lambda _, what: made.put(what))
+    try:
+        player.seek(messages[-1].time_s)
+        assert "this moment cannot be shown: " in made.get(timeout=10.0)
+        player.seek(messages[30].time_s)
+        assert made.get(timeout=10.0)[0].mode == "VERNIER"
+    finally:
+        player.close()
+
+
+def test_a_snapshot_whose_loop_has_no_proper_name_is_left_out(tmp_path):
+    messages = FakeSupervisor().messages(100)
+    renamed = with_states(messages, lambda loop: replace(loop, name="it's"))
+    run = LoggedRun(write_log(tmp_path / "log.mcap", renamed), loops_at_start)
+    assert set(at(run, messages[-1].time_s).loops) == {"right"}

@@ -15,7 +15,7 @@ from fitctl.tui.steps import StepFacts, StepList
 from fitctl.tui.widgets.header import Header
 from tests.instruments.fake_supervisor import FakeSupervisor
 from tests.tui.commissioned import GO, OUTPUT, RIG, commissioning
-from tests.tui.fixed import FixedApp, settle
+from tests.tui.fixed import FakeJob, FixedApp, settle
 from tests.tui.live import header_text, notifications
 from tests.tui.piloted import pressed, run, run_app, sent
 
@@ -58,6 +58,15 @@ def test_it_opens_on_the_steps_and_the_next_one_is_chosen():
         assert "stack 2: check the cable" in facts
 
     on_console(scenario)
+
+
+def test_a_record_that_is_not_whole_is_told_and_ends_nothing(monkeypatch):
+    async def scenario(app, pilot):
+        assert app.view.query_one(StepList).step is None
+        assert "fitctl commission --list" in notifications(app)
+
+    monkeypatch.setattr(FakeJob, "text", lambda *_: '"done": true}]}')
+    assert on_console(scenario).jobs[0].ended
 
 
 def test_what_a_step_found_and_what_it_needs_is_beside_the_list():

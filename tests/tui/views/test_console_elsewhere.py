@@ -7,7 +7,7 @@ import pytest
 from fitctl.messages.commands import SequenceControl
 from fitctl.messages.telemetry import LearningState
 from fitctl.tui.dialogs import Confirm
-from fitctl.tui.widgets.margins import Margins
+from fitctl.tui.widgets.margins import DesignFigures, DesignInUse, Margins
 from fitctl.tui.widgets.printed import Printed
 from fitctl.tui.widgets.spectrum import ErrorBudget
 from tests.instruments.fake_supervisor import FakeSupervisor
@@ -182,3 +182,10 @@ def test_a_name_that_stands_for_no_design_is_a_problem_and_no_design(monkeypatch
 
     monkeypatch.setattr(FakeJob, "text", lambda _: json.dumps({"residual_px": 0.013}))
     attached(scenario, rig=RIG, controller="bound")
+
+
+@pytest.mark.parametrize("printed", ["", '"stable": true}'])
+def test_figures_of_a_design_that_are_no_json_are_a_problem(printed):
+    figures = DesignFigures()
+    figures.accept(DesignInUse("right", "integrator"), printed, 0)
+    assert figures.problem.startswith("fitctl design printed no JSON: ")

@@ -218,6 +218,16 @@ def test_a_file_that_cannot_be_read_does_not_take_the_place_of_what_moves_the_st
     assert unreadable.ended
 
 
+def test_a_list_of_sequences_that_is_not_whole_is_told_and_ends_nothing(monkeypatch):
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "4")
+        assert app.view.query_one(SequenceList).documents == []
+        assert "fitctl sequence list --json: cannot be shown" in notifications(app)
+
+    monkeypatch.setattr(FakeJob, "text", lambda *_: '"A star"}]')
+    assert run(scenario).jobs[0].ended
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("state", "wanted", "key", "action"),
