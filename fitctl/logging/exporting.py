@@ -91,13 +91,24 @@ def _write_all(
 def _blocks(path: Path, topics: list[str], *, frames: bool) -> Iterator[tuple[str, Columns]]:
     wanted = [topic for topic in topics if frames or topic != TOPICS[FrameRecord]]
     for topic, columns in column_blocks(path, wanted, _ROWS):
-        if topic == TOPICS[FrameRecord]:
-            columns["pixels_dn"] = columns.pop("data")
-            del columns["encoding"], columns["step"]  # mono16, and twice the width
-        elif topic == TOPICS[Event]:
-            columns["level"] = np.array([Log.Level.Name(level) for level in columns["level"]])
-            del columns["file"], columns["line"]
+        try:
+            if topic == TOPICS[FrameRecord]:
+                columns["pixels_dn"] = columns.pop("data")
+                del columns["encoding"], columns["step"]  # mono16, and twice the width
+            elif topic == TOPICS[Event]:
+                levels = columns["level"].tolist()
+                columns["level"] = np.array([Log.Level.Name(level) for level in levels])
+                del columns["file"], columns["line"]
+        except (KeyError, TypeError, ValueError) as error:
+            raise _foreign(f"{path}: {topic}", error) from None
         yield topic, {_RENAMED.get(name, name): column for name, column in columns.items()}
+
+
+def _foreign(what: str, error: Exception) -> LogError:
+    return LogError(
+        f"{what} is not as fitctl records it: {error}; choose other topics with --topic, or name a log that "
+        "fitctl recorded"
+    )
 
 
 def _csv(file: Path, stack: ExitStack) -> Write:
@@ -143,11 +154,17 @@ def _npz(file: Path, stack: ExitStack) -> Write:
             name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]
         }
         if "pixels_dn" in columns:
-            columns["pixels_dn"] = _images(file, columns)
+            try:
+                columns["pixels_dn"] = _images(file, columns)
+            except (KeyError, TypeError, ValueError) as error:
+                raise _foreign(f"{file}: the log's frame", error) from None
         np.savez_compressed(file, **columns)
 
     def write(columns: Columns) -> None:
         if not blocks:
+            if taken := columns.keys() & {"file", "allow_pickle"}:  # savez's own arguments
+                msg = f"{file}: npz cannot hold a column named {taken.pop()}; export csv or parquet"
+                raise LogError(msg)
             stack.push(lambda error, *_: finish() if error is None else None)
         blocks.append(columns)
 

@@ -30,7 +30,8 @@ from fitctl.logging.indexed import IndexedReader
 from fitctl.logging.records import Tick
 from fitctl.logging.schemas import TOPICS
 
-# How a field is gathered (a type code of the array module; texts in a list) and what it becomes.
+# By column: how it is gathered (a type code of the array module; texts in a list) and what it becomes.
+_Form = dict[str, tuple[str, Any]]
 _COLUMNS: dict[int, tuple[str, Any]] = {
     FieldDescriptor.CPPTYPE_DOUBLE: ("d", np.float64),
     FieldDescriptor.CPPTYPE_INT64: ("q", np.int64),
@@ -169,15 +170,34 @@ def column_blocks(
     Raises
     ------
     LogError
-        If the log cannot be read.
+        If the log cannot be read, a topic's messages do not all have the same columns, or a time does not go
+        into one.
     """
     chosen = fields or {}
     blocks: dict[str, _Block] = {}
+    classes: dict[str, type] = {}
+    forms: dict[str, _Form] = {}
     for entry in read_records(path, topics):
+        if classes.get(entry.topic) is not type(entry.message):
+            classes[entry.topic] = type(entry.message)
+            form = _form(entry.message, chosen.get(entry.topic))
+            if forms.setdefault(entry.topic, form) != form:
+                msg = (
+                    f"{path}: {entry.topic} has two forms, as in a log merged from logs of two versions of "
+                    "fitctl; expected one: read each of those logs by itself"
+                )
+                raise LogError(msg)
         block = blocks.get(entry.topic)
         if block is None:
-            block = blocks[entry.topic] = _Block(entry.message, chosen.get(entry.topic))
-        block.add(entry)
+            block = blocks[entry.topic] = _Block(forms[entry.topic])
+        try:
+            block.add(entry)
+        except OverflowError:
+            msg = (
+                f"{path}: {entry.topic} is not as fitctl records it: a record's time is 2**63 ns or more; "
+                "expected nanoseconds since 1970: `fitctl log cut` leaves such records out with --to"
+            )
+            raise LogError(msg) from None
         if len(block) >= rows:
             yield entry.topic, block.columns()
             del blocks[entry.topic]
@@ -205,28 +225,28 @@ def tick_arrays(path: Path, loop: str) -> Columns:
     raise LogError(msg)
 
 
-class _Block:
-    """Messages of one topic, field by field, with the fields of the file, which may be older than this code."""
-
-    def __init__(
-        self, message: google.protobuf.message.Message, chosen: Collection[str] | None
-    ) -> None:
-        fields = [
-            field
-            for field in message.DESCRIPTOR.fields
-            if field.cpp_type in _COLUMNS and (chosen is None or field.name in chosen)
-        ]
-        kinds = dict.fromkeys(HEADER, _COLUMNS[FieldDescriptor.CPPTYPE_INT64])
-        for field in fields:
+def _form(message: google.protobuf.message.Message, chosen: Collection[str] | None) -> _Form:
+    """A message's columns, by the fields of the file, which may be older than this code."""
+    form = {}
+    for field in message.DESCRIPTOR.fields:
+        if field.cpp_type in _COLUMNS and (chosen is None or field.name in chosen):
             # Only the type distinguishes text from bytes.
             is_bytes = field.type == FieldDescriptor.TYPE_BYTES
-            kinds[field.name] = ("", np.object_) if is_bytes else _COLUMNS[field.cpp_type]
+            form[field.name] = ("", np.object_) if is_bytes else _COLUMNS[field.cpp_type]
+    return form
+
+
+class _Block:
+    """Messages of one topic, field by field."""
+
+    def __init__(self, form: _Form) -> None:
+        kinds = dict.fromkeys(HEADER, _COLUMNS[FieldDescriptor.CPPTYPE_INT64]) | form
         self._dtypes = {name: dtype for name, (_, dtype) in kinds.items()}
         self._values: dict[str, Any] = {
             name: array(code) if code else [] for name, (code, _) in kinds.items()
         }
         self._header = [self._values[name] for name in HEADER]
-        self._fields = [(field.name, self._values[field.name]) for field in fields]
+        self._fields = [(name, self._values[name]) for name in form]
 
     def __len__(self) -> int:
         return len(self._header[0])

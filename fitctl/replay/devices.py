@@ -67,7 +67,9 @@ class LoggedClock:
 
 def logged_error(kind: str, text: str) -> DeviceError:
     """An error of a device as it was logged: its class, and all of its text."""
-    of = getattr(interface, kind, DeviceError)
+    of = getattr(interface, kind, None)
+    if not (isinstance(of, type) and issubclass(of, DeviceError)):
+        of = DeviceError
     return of.__new__(of, text)  # its parts are in the text already
 
 

@@ -107,7 +107,7 @@ class LoggedStep:
 
     def add_frame(self, message: Any, number: int) -> None:
         """One frame of the step; one that is damaged counts for none."""
-        whole = len(message.data) == message.step * message.height
+        whole = len(message.data) == 2 * message.width * message.height  # 16 bit a pixel
         if number in {tick.number % 2**32 for tick in self.ticks.values()}:
             self.frame = message if whole else None
         elif whole:
@@ -212,11 +212,24 @@ def _records(info: LogInfo, rig: Rig) -> Iterator[tuple[Logged, int]]:
             there = ", ".join(sorted(info.counts)) or "none"
             msg = f"{info.path}: has no {topic}, so there is nothing to replay; topics: {there}"
             raise LogError(msg)
+    loops = {
+        TOPICS[kind].format(loop=loop): loop
+        for kind in KINDS
+        if "{loop}" in TOPICS[kind]
+        for loop in rig.loops
+    }
     begun: set[str] = set()
     is_first = True
     for entry in read_records(info.path, list(kinds)):
         kind = kinds[entry.topic]
         message: Any = entry.message
+        of_loop = getattr(message, "loop", None)
+        if loops.get(entry.topic, of_loop) != of_loop:
+            msg = (
+                f"{info.path}: {entry.topic} is not as fitctl records it: a record is of loop {of_loop!r}; "
+                f"expected {loops[entry.topic]!r}; name a log that fitctl recorded"
+            )
+            raise LogError(msg)
         if is_first:
             _insist_on_start(info, entry.publish_time_ns)
             is_first = False

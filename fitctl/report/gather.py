@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.logging.errors import LogError
+from fitctl.logging.files import MEND
 from fitctl.logging.reading import HEADER, Columns, column_blocks
 from fitctl.logging.records import (
     ControllerChange,
@@ -229,7 +230,16 @@ def _series(run: Run) -> dict[str, tuple[str, dict[str, Any]]]:
 
 def _room(run: Run, topic: str, wanted: dict[str, Any]) -> Columns:
     """For all rows of a topic at once: put together from pieces, hours would be held twice."""
-    rows = sum(log.counts.get(topic, 0) for log in run.logs)
+    rows = 0
+    for log in run.logs:
+        count, size = log.counts.get(topic, 0), log.path.stat().st_size
+        if log.finished and count > size:
+            msg = (
+                f"{log.path}: is damaged: its index counts {count} records of {topic}, and the file has "
+                f"{size} bytes; {MEND}"
+            )
+            raise LogError(msg)
+        rows += count
     return {name: np.empty(rows, dtype) for name, dtype in wanted.items()}
 
 

@@ -7,20 +7,26 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from samples.learner_reports import report
+from samples.log_samples import RUN_INFO, frame, tick, write_log
 from samples.replay_courses import hold_a_star
 
 from fitctl.cli import main
 from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.design.document import design_json
+from fitctl.drivers.interface import DeviceError, DeviceTimeout
+from fitctl.logging import schemas
+from fitctl.logging.errors import LogError
 from fitctl.logging.exporting import export
 from fitctl.logging.reading import log_info
-from fitctl.logging.records import ControllerChange, Event
+from fitctl.logging.records import ControllerChange, Event, Tick
 from fitctl.logging.schemas import MESSAGES
 from fitctl.messages.command_table import command_record
 from fitctl.messages.commands import Reply, SetController
-from fitctl.replay.log import Logged, LoggedStep
+from fitctl.replay.devices import logged_error
+from fitctl.replay.log import Logged, LoggedStep, read_steps
 from fitctl.replay.replay import Replay
 from tests.samples.logged_simulation import LoggedSimulation
 
@@ -151,8 +157,6 @@ def test_no_report_of_a_learner_names_a_design_to_run(tmp_path, monkeypatch, nam
 
 
 def test_a_topic_is_no_path_to_export_to(tmp_path, monkeypatch):
-    from fitctl.logging import schemas
-
     topics = {**schemas.TOPICS, Event: "/../\x1b]0;x\x07\n/planted"}
     with monkeypatch.context() as patched:
         patched.setattr(schemas, "TOPICS", topics)
@@ -165,3 +169,26 @@ def test_a_topic_is_no_path_to_export_to(tmp_path, monkeypatch):
     assert file.parent == tmp_path / "out"
     assert file.name.isprintable()
     assert Path(file).exists()
+
+
+def test_a_record_of_another_loop_than_its_topic_s_is_refused(tmp_path, monkeypatch):
+    with monkeypatch.context() as patched:
+        patched.setattr(schemas, "TOPICS", {**schemas.TOPICS, Tick: "/fit/right/tick"})
+        path = write_log(tmp_path / "a.mcap", [RUN_INFO, tick(1, loop="other"), frame(1)])
+
+    refusal = r"a\.mcap: /fit/right/tick is not as fitctl records it: .*'other'; expected 'right'"
+    with pytest.raises(LogError, match=refusal):
+        list(read_steps(log_info(path), load_rig(default_rig_path())))
+
+
+def test_a_frame_whose_data_are_not_its_size_counts_for_none():
+    step = LoggedStep()
+    for data in (b"12", bytes(12)):
+        step.add_frame(RawImage(width=3, height=2, step=len(data) // 2, data=data), 1)
+    assert [len(each.data) for each in step.older] == [12]
+
+
+@pytest.mark.parametrize("kind", ["Frame", "np", "Callable", "__doc__", "none"])
+def test_the_name_of_an_error_makes_no_other_object(kind):
+    assert type(logged_error(kind, "text")) is DeviceError
+    assert type(logged_error("DeviceTimeout", "text")) is DeviceTimeout

@@ -1,6 +1,7 @@
 """Which files are a run, and what becomes of files that are not whole, double, empty or somebody else's."""
 
 import copy
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -154,6 +155,17 @@ def test_records_of_another_shape_are_refused_in_one_line(rig, tmp_path, kind, t
         gather(find_run([path]))
 
     assert "\n" not in str(raised.value)
+
+
+def test_more_records_than_bytes_in_a_file_are_refused(rig, tmp_path):
+    path = tmp_path / "off.mcap"
+    record(rig, path, lambda simulation: simulation.run(1.0))
+    run = find_run([path])
+    counts = {TOPICS[Tick].format(loop="right"): 2**62}
+    forged = run._replace(logs=(dataclasses.replace(run.logs[0], counts=counts),))
+
+    with pytest.raises(LogError, match=r"off\.mcap: is damaged: its index counts .*log recover"):
+        gather(forged)
 
 
 def foreign(path, metadata):

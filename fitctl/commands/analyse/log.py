@@ -206,7 +206,7 @@ def _summary(log: Path, most_bytes: int) -> LogSummary:
             line.error = _TOO_LARGE
             return line
         findings = find(find_run([log]))
-    except LogError as error:
+    except (LogError, ConfigError) as error:
         line.error = str(error)
         return line
     except OSError as error:
@@ -313,11 +313,13 @@ def cut(
     log = chosen_log("log cut", log, rig, latest=latest)
     found = log_info(log)
     from_ns = time_ns("--from", from_, found)
-    to_ns = 2**63 if to is None else time_ns("--to", to, found)
+    to_ns = 2**64 if to is None else time_ns("--to", to, found)  # MCAP has unsigned 64 bit
     if to_ns <= from_ns:
         msg = (
             f"cut: --to {to} is not after --from {from_}; choose a later --to, or an earlier --from"
         )
+        if to is None:
+            msg = f"cut: {log} ends before --from {from_}; choose an earlier --from"
         raise ConfigError(msg)
     target = out or log.with_name(f"{log.stem}_cut.mcap")
     topics = _topics(found, topic)
@@ -369,8 +371,9 @@ def export(
     The names of the columns have units.
     """
     log = chosen_log("log export", log, rig, latest=latest)
+    topics = _topics(log_info(log), topic)
     target = out or log.with_name(f"{log.stem}_{format_}")
-    files = exporting.export(log, target, format_.value, _topics(log_info(log), topic))
+    files = exporting.export(log, target, format_.value, topics)
     if as_json and files:
         written = [{"file": str(file), "rows": rows} for file, rows in sorted(files.items())]
         say(to_json({"log": str(log), "files": written}))

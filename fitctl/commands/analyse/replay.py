@@ -189,8 +189,15 @@ def _rig(
     rig = read(overrides)
     if controller is not None:
         rig = read([*overrides, *controller_overrides(rig.stellar_loops, controller)])
-    then = json.loads(in_log)
-    needed = (sorted(then["loops"]), then["camera"]["width_px"], then["camera"]["height_px"])
+    try:
+        then = json.loads(in_log)
+        needed = (sorted(then["loops"]), then["camera"]["width_px"], then["camera"]["height_px"])
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        msg = (
+            f"{origin}: is not as fitctl records it: {error!r}; expected JSON with tables loops and camera; "
+            "name a log that fitctl recorded"
+        )
+        raise ConfigError(msg) from None
     given = (sorted(rig.loops), rig.camera.width_px, rig.camera.height_px)
     if given != needed:
         msg = (

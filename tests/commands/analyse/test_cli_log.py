@@ -127,6 +127,12 @@ def test_cut_takes_seconds_or_utc_and_topics_by_pattern(log, whole, span):
     ]
 
 
+def test_cut_leaves_no_late_record_out_unasked(log, tmp_path):
+    late = write_log(tmp_path / "late.mcap", [tick(1)], start_s=9.3e9)  # after 2**63 ns
+    status, text, _ = log("cut", late)
+    assert (status, "1 of 1 records" in text) == (0, True)
+
+
 def test_merge_joins_what_cut_took_apart(log, whole):
     head, tail, target = (whole.with_name(f"{name}.mcap") for name in ("head", "tail", "all"))
     log("cut", whole, "--to", "9", "--out", head)
@@ -246,6 +252,7 @@ def test_keep_marks_and_unmarks(log, whole):
         (["cut", "LOG", "--from", "nan"], "--from nan: is no time"),
         (["cut", "LOG", "--to", "1e300"], "--to 1e300: is no time"),
         (["cut", "LOG", "--from", "5", "--to", "5"], "--to 5 is not after --from 5"),
+        (["cut", "LOG", "--from", "9999-12-31T23:59:59"], "ends before --from 9999-12-31T23:59:59"),
         (["cut", "LOG", "--from", "5000"], "has no record of these topics in that time"),
         (["cut", "LOG", "--topic", "/fit/left/*"], "no such topic. Available: /fit/camera/frame"),
         (
@@ -255,6 +262,7 @@ def test_keep_marks_and_unmarks(log, whole):
         (["merge", "LOG"], "--out"),
         (["merge", "LOG", "TEXT", "--out", "new.mcap"], "is not an MCAP log"),
         (["export", "LOG", "--format", "xlsx"], "xlsx"),
+        (["export", ".", "--format", "csv"], ".: cannot be opened: not a regular file"),
         (
             ["export", "LOG", "--format", "csv", "--topic", "/fit/camera/frame"],
             "need npz or parquet",

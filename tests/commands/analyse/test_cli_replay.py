@@ -2,8 +2,10 @@
 
 import json
 
+import msgspec
 import numpy as np
 import pytest
+from samples.log_samples import RUN_INFO, tick, write_log
 
 from fitctl.cli import main
 from fitctl.config import default_rig_path, load_rig
@@ -170,3 +172,15 @@ def test_what_cannot_be_replayed_is_one_line_and_status_2(replay, log, arguments
     (line,) = (line for line in errors.splitlines() if "replaying" not in line)
     assert (status, text) == (2, "")
     assert said in line
+
+
+@pytest.mark.parametrize("rig_json", ["nonsense", "[1]", '{"loops": 3}', '{"loops": {}}'])
+def test_a_log_whose_rig_is_none_is_refused_with_a_rig_file_too(replay, tmp_path, rig_json):
+    info = msgspec.structs.replace(RUN_INFO, rig_json=rig_json)
+    path = write_log(tmp_path / "a.mcap", [info, tick(1)])
+
+    status, _, error = replay(path, "--rig", default_rig_path())
+
+    assert status == 2
+    assert f"the rig in {path}: is not as fitctl records it" in error
+    assert len(error.splitlines()) == 1

@@ -3,6 +3,7 @@
 import json
 
 import pytest
+from samples.log_samples import RUN_INFO, tick, write_log
 from samples.report_samples import record
 
 from fitctl.cli import main
@@ -57,3 +58,12 @@ def test_a_line_for_people_has_them_too_beside_a_log_that_is_missing(log, tmp_pa
     status, (line,) = printed(capsys, tmp_path / "none.mcap", log)
     assert status == 2
     assert "requirement met: right 0.0" in line
+
+
+def test_a_log_whose_rig_is_of_another_version_does_not_end_the_list(tmp_path, capsys):
+    old = write_log(tmp_path / "old.mcap", [RUN_INFO, tick(1)])
+    status, lines = printed(capsys, "--json", old, tmp_path / "none.mcap")
+    assert status == 2
+    first, second = (json.loads(line)["error"] for line in lines)
+    assert "old.mcap: rig file in it" in first
+    assert "none.mcap" in second
