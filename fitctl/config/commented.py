@@ -34,7 +34,7 @@ def dump_commented(document: tomlkit.TOMLDocument) -> str:
     )
     headings: set[str] = set()
     lines = []
-    for line in text.rstrip().splitlines():
+    for line in text.rstrip().split("\n"):  # a text may have other ends of lines
         if line.startswith(_RULE) and line in headings:
             continue
         headings.add(line)

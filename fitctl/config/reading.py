@@ -143,7 +143,10 @@ def read_toml(path: Path, missing: str) -> dict[str, Any]:
     """
     try:
         return tomllib.loads(read_text(path, missing))
-    except tomllib.TOMLDecodeError as error:
+    except (
+        ValueError,
+        RecursionError,
+    ) as error:  # also a number of too many digits, and tables too deep
         msg = f"{path}: not TOML: {error}; correct it there: expected key = value, or [table]"
         raise ConfigError(msg) from None
 
@@ -167,7 +170,7 @@ def read_text(path: Path, missing: str) -> str:
             f"{_MOST_BYTES >> 20} MiB that you may read"
         )
         raise ConfigError(msg) from None
-    except UnicodeDecodeError as error:
+    except ValueError as error:  # no UTF-8, or a NUL in the path
         msg = f"{path}: cannot be read: {error}; expected a text file in UTF-8"
         raise ConfigError(msg) from None
 
@@ -303,7 +306,7 @@ def old_actions(document: Mapping[str, Any]) -> list[tuple[str, Any]]:
     return [
         (name, row)
         for name, row in (rows.items() if isinstance(rows, dict) else ())
-        if isinstance(row, dict) and row.get("action") in RENAMED_ACTIONS
+        if isinstance(row, dict) and str(row.get("action")) in RENAMED_ACTIONS
     ]
 
 
@@ -356,7 +359,7 @@ def parse_override(text: str, example: str) -> tuple[list[str], Any]:
         raise ConfigError(msg)
     try:
         return parts, tomllib.loads(f"value = {value_text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):
         return parts, value_text
 
 

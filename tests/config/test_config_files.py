@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from fitctl.config import ConfigError, default_rig_path, load_rig
+from fitctl.config.commented import dump_commented, parse_commented
 from fitctl.config.devices import DEVICE_TABLES
 from fitctl.config.reading import _is_tag
 
@@ -25,6 +26,8 @@ def test_no_such_file(tmp_path):
         (b"[camera\n", r"not TOML: .*\(at line 1, column 8\)"),
         (b"name = 'a'\nname = 'b'\n", r"not TOML: .*line 2"),
         (b"\xff\xfe\x00", "cannot be read: 'utf-8' codec"),
+        (b"x = " + b"[" * 3000, "not TOML: "),
+        (b"schema_version = " + b"1" * 5000, "not TOML: .*digits"),
         (b"", "schema_version: is missing"),
     ],
 )
@@ -33,6 +36,21 @@ def test_a_file_that_is_not_a_rig(tmp_path, content, said):
     path.write_bytes(content)
     with pytest.raises(ConfigError, match=rf"odd\.toml: {said}"):
         load_rig(path)
+
+
+def test_a_path_with_a_nul_and_a_number_without_end_are_refused(tmp_path):
+    path = tmp_path / "odd.toml"
+    path.write_text('base = "a\\u0000b"\n')
+    with pytest.raises(ConfigError, match="cannot be read: embedded null byte"):
+        load_rig(path)
+    with pytest.raises(ConfigError, match=r"camera\.width_px"):
+        load_rig(default_rig_path(), [f"camera.width_px={'1' * 5000}"])
+
+
+def test_a_text_with_other_ends_of_lines_stays_one_line():
+    text = 'description = "a\u2028b\u0085c"\n'
+
+    assert dump_commented(parse_commented(text)) == text
 
 
 @pytest.mark.parametrize("path", ["/", "/dev/null"])
