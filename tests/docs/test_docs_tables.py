@@ -137,8 +137,10 @@ def test_the_metrics_are_those_that_are_served():
         TrippedInterlock(name="any", since_s=0.0, action="warn", reset="itself", reason="")
     ]
     collector = InstrumentCollector()
+    message = supervisor.message()
+    overlap = msgspec.structs.replace(of_kind(Overlap), time_s=message.time_s)
     message = msgspec.structs.replace(
-        supervisor.message(), metrology_ticks=[of_kind(MetrologyTick)], overlaps=[of_kind(Overlap)]
+        message, metrology_ticks=[of_kind(MetrologyTick)], overlaps=[overlap]
     )
     collector.accept(message, time.monotonic())
     rows = [
