@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.learn_online import NIGHTS, outcome
-from fitctl.config import StackHysteresis, default_rig_path, load_rig
+from fitctl.config import ConfigError, StackHysteresis, default_rig_path, load_rig
 from fitctl.logging.records import ControllerChange, Event, MetrologyTick
 from fitctl.messages.modes import Mode
 from fitctl.model.compiled import numba_installed
@@ -466,12 +466,13 @@ def test_a_result_of_all_loops_is_the_simulations(kind):
                 assert ours == pytest.approx(value, rel=1e-9, abs=1e-12), (name, field)
 
 
-def test_a_course_that_the_hexapod_refuses_is_simulated():
+def test_a_course_that_the_hexapod_refuses_is_bad_input():
     rig = rig_of_testbed("collector.motion.amplitude_mm=60.0", "collector.motion.kind=sine",
                        "collector.motion.start_s=2.0", "collector.motion.frequency_hz=0.001")  # fmt: skip
 
     assert Batch(rig).run(1, 4.0).ended == REFUSED_COURSE
-    assert Batch(rig).result(1, 4.0).loops["right"].frames > 0
+    with pytest.raises(ConfigError, match=r"collector\.motion: .* within -50 and 50"):
+        Batch(rig).result(1, 4.0)
 
 
 def test_a_feedforward_that_the_batch_does_not_model_is_refused():
