@@ -143,10 +143,7 @@ def read_toml(path: Path, missing: str) -> dict[str, Any]:
     """
     try:
         return tomllib.loads(read_text(path, missing))
-    except (
-        ValueError,
-        RecursionError,
-    ) as error:  # also a number of too many digits, and tables too deep
+    except (ValueError, RecursionError) as error:  # also too many digits, and tables too deep
         msg = f"{path}: not TOML: {error}; correct it there: expected key = value, or [table]"
         raise ConfigError(msg) from None
 

@@ -42,6 +42,11 @@ def fitctl(*arguments, before=(), **options):
     )
 
 
+def folders(logs, sockets):
+    """Options by which a demo has its log and its sockets in folders of the test."""
+    return ("--set", f"logging.folder={logs}", "--set", f"service.folder={sockets}")
+
+
 def end(process, number=signal.SIGTERM, timeout_s=20.0):
     """Send a signal and wait; returns the exit status."""
     if process.poll() is None:

@@ -18,7 +18,7 @@ from fitctl.messages.client import Client
 from fitctl.messages.commands import Recover, Shutdown
 from fitctl.messages.waiting import wait_for_end
 
-from .conftest import START_S, child, end, fitctl, nothing_was_lost_without_a_stall
+from .conftest import START_S, child, end, fitctl, folders, nothing_was_lost_without_a_stall
 
 pytestmark = pytest.mark.timeout(300)
 SUMMARY_KEYS = {
@@ -32,10 +32,6 @@ SUMMARY_KEYS = {
     "late_ticks",
     "log",
 }
-
-
-def folders(tmp_path, sockets):
-    return ("--set", f"logging.folder={tmp_path}", "--set", f"service.folder={sockets}")
 
 
 def demo(tmp_path, sockets, *arguments):

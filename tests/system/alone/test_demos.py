@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from ..conftest import START_S, end, fitctl
+from ..conftest import START_S, end, fitctl, folders
 
 
 def test_two_demos_begun_at_once_are_two_instruments(tmp_path, sockets):
@@ -17,8 +17,7 @@ def test_two_demos_begun_at_once_are_two_instruments(tmp_path, sockets):
             "--headless",
             "--duration",
             1,
-            *("--set", f"logging.folder={tmp_path}"),
-            *("--set", f"service.folder={sockets}"),
+            *folders(tmp_path, sockets),
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
         )
@@ -43,9 +42,8 @@ def start_demo(tmp_path, sockets, own_names):
     started = []
 
     def start():
-        folders = ("--set", f"logging.folder={tmp_path}", "--set", f"service.folder={sockets}")
         demo = fitctl(
-            *("demo", "--headless", "--duration", 600, *folders),
+            *("demo", "--headless", "--duration", 600, *folders(tmp_path, sockets)),
             before=own_names,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
