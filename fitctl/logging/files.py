@@ -8,13 +8,14 @@ import struct
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import IO
+from typing import IO, TypeVar
 
 import google.protobuf.message
 import lz4.frame
 import mcap.stream_reader
 import zstandard
 from mcap.exceptions import McapError
+from mcap.records import Channel, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from fitctl.files import open_regular
@@ -40,6 +41,7 @@ MEND = "`fitctl log recover` saves what is sound into a new file"
 
 # A chunk is logging.chunk_bytes and a record, at most; a few kilobytes can unpack to gigabytes.
 _MOST_CHUNK_BYTES = 64 << 20
+_MOST_DESCRIBED_BYTES = 16 << 20
 
 
 def _too_large() -> McapError:
@@ -61,6 +63,35 @@ def _unpack_lz4(data: bytes) -> bytes:
         msg = "a chunk's lz4 frame is cut off"
         raise McapError(msg)
     return unpacked
+
+
+_Kept = TypeVar("_Kept", bound=Schema | Channel)
+
+
+class Described(dict[int, _Kept]):
+    """A log's schemas or channels by number: the first of each number, and of at most 16 MiB together.
+
+    Those of fitctl have less than 100 kB. They stay in memory as long as the log is read, and a chunk of a few
+    kilobytes may unpack to hundreds of megabytes of them.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self._path = path
+        self._bytes = 0
+
+    def __setitem__(self, number: int, record: _Kept) -> None:
+        if number in self:
+            return
+        parts = vars(record).values()
+        self._bytes += sum(len(part if isinstance(part, bytes) else str(part)) for part in parts)
+        if self._bytes > _MOST_DESCRIBED_BYTES:
+            msg = (
+                f"{self._path}: has schemas or channels of more than {_MOST_DESCRIBED_BYTES >> 20} MiB; "
+                "expected a log that fitctl recorded"
+            )
+            raise LogError(msg)
+        super().__setitem__(number, record)
 
 
 # The one place of the library at which every reader unpacks; it knows no limit of its own.

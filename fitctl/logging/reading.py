@@ -25,7 +25,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from numpy.typing import NDArray
 
 from fitctl.logging.errors import LogError
-from fitctl.logging.files import opened, up_to_the_tear
+from fitctl.logging.files import Described, opened, up_to_the_tear
 from fitctl.logging.indexed import IndexedReader
 from fitctl.logging.records import Tick
 from fitctl.logging.schemas import TOPICS
@@ -133,6 +133,10 @@ def read_records(path: Path, topics: Collection[str] | None = None) -> Iterator[
     with opened(path) as (stream, finished), up_to_the_tear(path, finished):
         kind = IndexedReader if finished else NonSeekingReader
         reader = kind(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        if isinstance(
+            reader, NonSeekingReader
+        ):  # an index is no smaller in the file than in memory
+            reader._schemas, reader._channels = Described(path), Described(path)
         # Not ordered by log time: it is already, and sorting a cut file gives nothing at all.
         for _, channel, header, message in reader.iter_decoded_messages(
             topics, log_time_order=False

@@ -22,7 +22,7 @@ from mcap.writer import MCAP0_MAGIC
 from mcap_protobuf.decoder import DecoderFactory
 
 from fitctl.logging.errors import LogError
-from fitctl.logging.files import DAMAGE, opened
+from fitctl.logging.files import DAMAGE, Described, opened
 from fitctl.logging.reading import LogMessage
 
 MOST_CHUNKS = 1_000_000
@@ -67,7 +67,8 @@ class SeekableLog:
     Raises
     ------
     LogError
-        If the file is missing or no MCAP log, holds no message, or has more chunks than `MOST_CHUNKS`.
+        If the file is missing or no MCAP log, holds no message, or has more chunks than `MOST_CHUNKS` or more
+        schemas than :class:`~fitctl.logging.files.Described` keeps.
     """
 
     def __init__(self, path: Path) -> None:
@@ -75,8 +76,8 @@ class SeekableLog:
         self.metadata: dict[str, dict[str, str]] = {}
         self.damaged = 0
         self._chunks: list[_ChunkPlace] = []
-        self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, Channel] = {}
+        self._schemas: Described[Schema] = Described(path)
+        self._channels: Described[Channel] = Described(path)
         self._decoders: dict[int, Callable[[bytes], Any] | None] = {}
         self._factory = DecoderFactory()
         # What comes before a torn end, or before damage, can be read.
@@ -174,10 +175,10 @@ class SeekableLog:
                 part = ReadDataStream(io.BytesIO(content[begin:end]))
                 if opcode == Opcode.SCHEMA:
                     schema = Schema.read(part)
-                    self._schemas.setdefault(schema.id, schema)
+                    self._schemas[schema.id] = schema
                 else:
                     channel = Channel.read(part)
-                    self._channels.setdefault(channel.id, channel)
+                    self._channels[channel.id] = channel
 
     def _unpack(self, stream: IO[bytes], place: _ChunkPlace) -> bytes:
         if place.size > MOST_BYTES_AT_ONCE:

@@ -14,6 +14,7 @@ from fitctl.logging.copying import recover
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import log_info, read_records
 from fitctl.logging.schemas import dark_npy_of
+from fitctl.logging.seeking import SeekableLog
 
 BOMB_BYTES = 300 << 20
 
@@ -51,6 +52,22 @@ def test_a_chunk_that_unpacks_to_too_much_is_damage(compression, finished, tmp_p
         tracemalloc.stop()
 
     assert peak < BOMB_BYTES
+
+
+@pytest.mark.parametrize("read", [lambda path: list(read_records(path)), SeekableLog])
+def test_schemas_that_unpack_to_too_much_are_refused(read, tmp_path):
+    path = tmp_path / "schemas.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream, compression=CompressionType.ZSTD, chunk_size=1 << 30)
+        writer.start()
+        for number in range(20):
+            schema = writer.register_schema(f"{number}", "protobuf", bytes(1 << 20))
+        writer.add_message(writer.register_channel("/x", "protobuf", schema), 1, b"", 1)
+        writer.finish()
+    path.write_bytes(path.read_bytes()[:-8])  # as of a recorder that was killed
+
+    with pytest.raises(LogError, match="schemas or channels of more than 16 MiB"):
+        read(path)
 
 
 @pytest.mark.long
