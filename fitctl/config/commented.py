@@ -8,7 +8,6 @@ from typing import Any
 import tomlkit
 
 _OF_TABLE = "#< "  # marks a comment that stood before its table
-_RULE = "# -----"
 
 
 def parse_commented(text: str) -> tomlkit.TOMLDocument:
@@ -28,18 +27,11 @@ def _into_table(match: re.Match[str]) -> str:
 
 
 def dump_commented(document: tomlkit.TOMLDocument) -> str:
-    """The text, with comments before their tables again; a heading that files laid over repeat stands once."""
+    """The text, with comments before their tables again."""
     text = re.sub(
         rf"(^\[.*\n)((?:^{_OF_TABLE}.*\n)+)", _before_table, tomlkit.dumps(document), flags=re.M
     )
-    headings: set[str] = set()
-    lines = []
-    for line in text.rstrip().split("\n"):  # a text may have other ends of lines
-        if line.startswith(_RULE) and line in headings:
-            continue
-        headings.add(line)
-        lines.append(line)
-    return "\n".join(lines) + "\n"
+    return text.rstrip() + "\n"
 
 
 def _before_table(match: re.Match[str]) -> str:

@@ -20,6 +20,7 @@ MOCK = "mock"
 ONE_STAR, TESTBED = "fit-mock", "fit-testbed"
 """The shipped rigs that a new one can begin with."""
 _CAN_DRIVER = "cia402"
+_HEADING = "# -----"
 _MOCKS_OF = {"ensemble": "tcp_port", "bal_analog": "modbus_port"}
 _HEAD = """written by `fitctl init` from the shipped rig.
 #
@@ -314,7 +315,19 @@ def new_rig_text(rig: str, name: str, devices: Mapping[str, Chosen]) -> str:
         del document["plant"], document["mocks"]
     else:
         _move_mocks_apart(document)
-    return f"# {name}: {_HEAD}{dump_commented(document)}"
+    return f"# {name}: {_HEAD}{_headings_once(dump_commented(document))}"
+
+
+def _headings_once(text: str) -> str:
+    """The text without headings that files laid over repeat."""
+    seen: set[str] = set()
+    lines = []
+    for line in text.rstrip().split("\n"):  # a text may have other ends of lines
+        if line.startswith(_HEADING) and line in seen:
+            continue
+        seen.add(line)
+        lines.append(line)
+    return "\n".join(lines) + "\n"
 
 
 def _put(

@@ -291,10 +291,14 @@ def _rig_in_log(text: str, origin: str, overrides: Sequence[str]) -> Rig:
         document["schema_version"] = SCHEMA_VERSION
         for _, row in old_actions(document):
             row["action"] = RENAMED_ACTIONS[row["action"]]
-    laid = _marked(document, origin)
-    for depth, override in enumerate(overrides, start=1):
-        _override(laid, override, depth)
-    return _valid(laid, origin)
+    try:
+        laid = _marked(document, origin)
+        for depth, override in enumerate(overrides, start=1):
+            _override(laid, override, depth)
+        return _valid(laid, origin)
+    except RecursionError:
+        msg = f"{origin}: its tables are nested too deep to read; expected the tables of a rig file"
+        raise ConfigError(msg) from None
 
 
 def old_actions(document: Mapping[str, Any]) -> list[tuple[str, Any]]:
@@ -430,19 +434,17 @@ def without_tags(location: Sequence[str]) -> list[str]:
 
 def _is_tag(before: Sequence[str], part: str) -> bool:
     """Whether this part of a place is the kind of the device or loop that is named before it."""
-    if before and before[-1] in DEVICE_TABLES:
-        return part in DEVICE_BY_TAG
-    return before[-2:-1] == ["loops"] and len(before) <= 3 and part in {STELLAR, METROLOGY}
+    if before[-2:-1] == ["loops"] and len(before) <= 3:  # a loop may have any name, also a device's
+        return part in {STELLAR, METROLOGY}
+    return bool(before) and before[-1] in DEVICE_TABLES and part in DEVICE_BY_TAG
 
 
 def _allowed_keys(location: Sequence[str]) -> list[str]:
     """The keys that the rig file may have at `location`, by walking the settings' own fields."""
     annotation: Any = Rig
     for index, part in enumerate(location):
-        if part in DEVICE_BY_TAG:
-            annotation = DEVICE_BY_TAG[part]
-        elif _is_tag(location[:index], part):
-            annotation = _of_kind(annotation, part)
+        if _is_tag(location[:index], part):
+            annotation = DEVICE_BY_TAG.get(part) or _of_kind(annotation, part)
         elif isinstance(annotation, type) and issubclass(annotation, Settings):
             annotation = annotation.model_fields[part].annotation
         elif get_origin(annotation) in {dict, list}:

@@ -6,6 +6,7 @@ another command makes needless.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
@@ -138,7 +139,7 @@ def _of_failure(loop: LoopState) -> Iterator[Trouble]:
         _after_failure(loop, failure.what, todo),
         (loop.name,),
         is_safe=is_safe,
-        number=round(1e3 * failure.time_s),
+        number=round(1e3 * failure.time_s) if math.isfinite(failure.time_s) else 0,
     )
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import msgspec
 import numpy as np
@@ -126,10 +126,21 @@ class ListFaults(_Question, frozen=True):
     rig: str = ""
 
 
+class ActiveFault(msgspec.Struct, frozen=True):
+    """A fault that is there now; fields as in :class:`fitctl.config.Fault`."""
+
+    device: str
+    kind: str
+    part: str
+    value: float | None
+    for_s: float | None
+    probability: float
+
+
 class FaultsNow(msgspec.Struct, frozen=True):
     """What is wrong now, or why the question could not be obeyed; and which rig's mocks these are."""
 
-    active: list[dict[str, Any]]
+    active: list[ActiveFault]
     error: str = ""
     rig: str = ""
 
@@ -187,7 +198,7 @@ class FaultTable:
             first = error.errors()[0]
             return FaultsNow([], f"{'.'.join(map(str, first['loc']))}: {first['msg']}")
         active = [fault for faults in self._devices.values() for fault in faults.active]
-        return FaultsNow([fault.model_dump(exclude={"at_s"}) for fault in active])
+        return FaultsNow([ActiveFault(**fault.model_dump(exclude={"at_s"})) for fault in active])
 
     def close(self) -> None:
         """Nothing goes wrong any more."""
@@ -347,7 +358,7 @@ def ask_bench(port: int, question: _AnyQuestion, answer: type[_Answer]) -> _Answ
     Raises
     ------
     ConnectionError
-        If none answers within five seconds.
+        If none answers within five seconds, or what answers is no bench.
     """
     context = zmq.Context()
     try:
@@ -358,6 +369,12 @@ def ask_bench(port: int, question: _AnyQuestion, answer: type[_Answer]) -> _Answ
             if not socket.poll(_TIMEOUT_MS):
                 msg = f"the mock testbed's bench does not answer at 127.0.0.1:{port}"
                 raise ConnectionError(msg)
-            return msgspec.msgpack.decode(socket.recv(), type=answer)
+            try:
+                return msgspec.msgpack.decode(socket.recv(), type=answer)
+            except UNDECODABLE:
+                msg = (
+                    f"what answers at 127.0.0.1:{port} is no bench of a mock testbed of this fitctl"
+                )
+                raise ConnectionError(msg) from None
     finally:
         context.term()

@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import CollectorMotion, ConfigError
+from fitctl.config import Collector, CollectorMotion, ConfigError
+from fitctl.model.metrology.geometry import transverse_axes
 
 Floats = NDArray[np.float64]
 Displacement = tuple[float, float]
@@ -84,6 +85,26 @@ def course_of(motion: CollectorMotion, seed: int) -> Course:
             return along(_RandomVelocity(motion, seed), far_mm, _RANDOM_PEAK * motion.rms_mm_s)
         case "file":
             return _from_file(Path(motion.file))
+
+
+def beyond(course: Course, collector: Collector) -> list[str]:
+    """Why the collector cannot follow the course, wherever it stands at its start: one text each."""
+    problems = []
+    hexapod = collector.hexapod
+    if course.velocity_mm_s > hexapod.velocity_limit_mm_s:
+        problems.append(
+            f"the motion reaches {course.velocity_mm_s:.3g} mm/s; collector.hexapod.velocity_limit_mm_s is "
+            f"{hexapod.velocity_limit_mm_s:g}"
+        )
+    spans_mm = np.ptp(np.array(course.reach_mm) @ transverse_axes(collector.geometry), axis=0)
+    travel = list(zip(type(hexapod.travel).model_fields, hexapod.travel.ends, strict=True))
+    for span_mm, (axis, (low, high)) in zip(spans_mm.tolist(), travel[:3], strict=True):
+        if span_mm > high - low:
+            problems.append(
+                f"the motion goes {span_mm:.4g} mm from end to end; collector.hexapod.travel.{axis} has "
+                f"{high - low:g}"
+            )
+    return problems
 
 
 def _back_and_forth(way_mm: float, range_mm: float) -> float:

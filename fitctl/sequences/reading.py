@@ -64,9 +64,9 @@ def read_sequence(path: Path, overrides: Iterable[str] = ()) -> Sequence:
     for override in overrides:
         _override(document, override)
     steps = document.get("steps")
-    for step in steps if isinstance(steps, list) else []:
+    for number, step in enumerate(steps if isinstance(steps, list) else [], start=1):
         if isinstance(step, dict) and step.get("step") == "stars":
-            step.update(_stars_of_file(step, path.parent))
+            step.update(_stars_of_file(step, path.parent, f"{path}: step {number} (stars)"))
     return sequence_from_document(document, str(path))
 
 
@@ -110,7 +110,7 @@ def make_step(kind: type[Step], keys: Mapping[str, Any]) -> Step:
     ConfigError
         One line for each mistake.
     """
-    more = _stars_of_file(keys, Path()) if kind is Stars else {}
+    more = _stars_of_file(keys, Path(), "stars") if kind is Stars else {}
     try:
         return kind.model_validate({**keys, **more})
     except ValidationError as error:
@@ -119,11 +119,14 @@ def make_step(kind: type[Step], keys: Mapping[str, Any]) -> Step:
         raise ConfigError("\n".join(lines)) from None
 
 
-def _stars_of_file(keys: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """The stars of the file that a step names, if it names one and has no others."""
+def _stars_of_file(keys: Mapping[str, Any], folder: Path, where: str) -> dict[str, Any]:
+    """The stars of the file that a step names, if it names one; errors name the step as `where`."""
     file = keys.get("file")
-    if not isinstance(file, str) or not file or keys.get("stars") is not None:
+    if not isinstance(file, str) or not file:
         return {}
+    if keys.get("stars") is not None:
+        msg = f"{where}: has both stars and file ({file}); expected one of them"
+        raise ConfigError(msg)
     return {"stars": [star.model_dump() for star in read_stars(folder / file)]}
 
 

@@ -1,6 +1,7 @@
 """Rig files as documents: what each key may be, and how a mistake is told."""
 
 import copy
+import json
 import tomllib
 from pathlib import Path
 
@@ -210,6 +211,19 @@ def test_a_key_that_is_misspelt_is_not_also_said_to_be_missing():
 def test_an_unknown_key_in_a_list_of_tables_is_named_too():
     text = complaint(changed(("plant", "loops", "right", "spots", 1, "flux"), 1.0))
     assert "plant.loops.right.spots.1.flux: unknown key; did you mean flux_dn?" in text
+
+
+@pytest.mark.parametrize("name", ["ensemble", "cia402", "dac", "device", "hexapod", "loops"])
+def test_an_unknown_key_of_a_loop_with_a_device_s_name_is_named_too(name):
+    document = json.loads(json.dumps(DOCUMENT).replace('"right"', f'"{name}"'))
+    document["plant"]["loops"][name]["line"] = []
+    text = complaint(document)
+    assert f"plant.loops.{name}.line: unknown key; did you mean lines? (allowed here: " in text
+
+
+def test_an_unknown_key_of_a_mock_has_the_mock_s_keys():
+    text = complaint(changed(("mocks", "loops", "right", "ensemble"), {"tcp_prt": 1}))
+    assert "mocks.loops.right.ensemble.tcp_prt: unknown key; did you mean tcp_port?" in text
 
 
 def test_an_unknown_key_like_no_other_has_no_hint():

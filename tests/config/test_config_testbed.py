@@ -94,6 +94,12 @@ def test_a_rig_survives_its_own_document():
     [
         ({"loops.left.link": "laser"},
          "loops.left.link: must name a loop of kind metrology (metrology), is 'laser'"),
+        ({"collector.motion.kind": "sine", "collector.motion.amplitude_mm": 60.0,
+          "collector.motion.frequency_hz": 0.01},
+         "collector.motion.amplitude_mm: must be at most 50 (is 60)"),
+        ({"collector.motion.kind": "drift", "collector.motion.range_mm": 40.0,
+          "collector.motion.direction_deg": 90.0},
+         "collector.motion.range_mm: must be at most 25 (is 40)"),
         ({"loops.left.link": "right"},
          "loops.left.link: must name a loop of kind metrology (metrology), is 'right'"),
         ({"loops.metrology.kind": "laser"},

@@ -174,6 +174,35 @@ def test_a_log_of_an_older_version_has_its_actions_by_their_old_names():
     assert rig_from_log(json.dumps(document), "a log").interlocks["frame_age"].action == "freeze"
 
 
+@pytest.mark.parametrize("action", [[], {}, None, 7])
+def test_an_action_that_is_no_name_is_one_line(action):
+    document = json.loads(load_rig(SHIPPED).model_dump_json()) | {"schema_version": 1}
+    document["interlocks"]["frame_age"]["action"] = action
+
+    with pytest.raises(ConfigError, match=r"interlocks.frame_age.action: must be"):
+        rig_from_log(json.dumps(document), "a log")
+
+
+def test_a_log_s_rig_with_tables_too_deep_is_one_line():
+    document = json.loads(load_rig(SHIPPED).model_dump_json())
+    for _ in range(600):
+        document["optics"] = {"a": document["optics"]}
+
+    with pytest.raises(ConfigError, match="a log: its tables are nested too deep"):
+        rig_from_log(json.dumps(document), "a log")
+
+
+def test_repeated_rules_of_a_persons_file_stay(old):
+    rule = "# --------------------"
+    old.write_text(f"{rule}\n# mine\n{rule}\n{old.read_text()}")
+
+    lines = upgrade(old).text.splitlines()
+    headings = [line for line in lines if line.startswith("# ----") and line != rule]
+
+    assert lines.count(rule) == 2
+    assert len(headings) == len(set(headings))  # what an upgrade adds brings none that is there
+
+
 def test_a_file_of_this_version_needs_no_upgrade(capsys):
     assert run(SHIPPED) == 2
     assert "needs no upgrade" in capsys.readouterr().err

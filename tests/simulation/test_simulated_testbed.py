@@ -64,11 +64,12 @@ def test_the_command_prints_loops_by_name_beside_what_they_have_in_common():
 
 
 def test_a_collector_that_is_to_move_beyond_its_travel_is_bad_input():
-    """On one axis: the rig file's check allows the diagonal."""
-    too_far = ["collector.motion.kind=sine", "collector.motion.amplitude_mm=60.0"]
+    """From zero: elsewhere it would have room, so that the rig file's check allows it."""
+    too_far = ["collector.motion.kind=sine", "collector.motion.amplitude_mm=30.0"]
+    too_far += [f"collector.hexapod.travel.{axis}=[-20.0,50.0]" for axis in ("x_mm", "y_mm")]
     slowly = ["collector.motion.frequency_hz=0.01", "collector.motion.start_s=0.5"]
 
-    with pytest.raises(ConfigError, match=r"collector.motion: .* within -50 and 50"):
+    with pytest.raises(ConfigError, match=r"collector.motion: .* within -20 and 50"):
         simulate_rig(load_rig(TESTBED, [*too_far, *slowly]), 0, 3.0)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import typer
@@ -17,7 +17,7 @@ from fitctl.commands.shared.supervisor import address_or_shipped, show_rig
 from fitctl.config import ConfigError, Rig
 from fitctl.messages.endpoints import service_folder
 from fitctl.messages.running import running_rigs
-from fitctl.mocks.bench import ClearFaults, FaultsNow, ListFaults, SetFault, ask_bench
+from fitctl.mocks.bench import ActiveFault, ClearFaults, FaultsNow, ListFaults, SetFault, ask_bench
 
 app = typer.Typer(help="Inject faults into running mocks.")
 
@@ -154,7 +154,7 @@ def _change(
         msg = f"fault: {now.error}"
         raise ConfigError(msg)
     if as_json:
-        say(to_json(now.active))
+        say(to_json(msgspec.to_builtins(now.active)))
         return
     for line in map(_line, now.active):
         say(line)
@@ -162,11 +162,11 @@ def _change(
         say("all is well")
 
 
-def _line(fault: dict[str, Any]) -> str:
-    words = [fault["device"], fault["kind"]]
-    words += [str(fault[key]) for key in ("part", "value") if fault[key] not in {"", None}]
-    if fault["for_s"] is not None:
-        words.append(f"for {fault['for_s']:g} s")
-    if fault["probability"] != 1:
-        words.append(f"probability {fault['probability']:g}")
+def _line(fault: ActiveFault) -> str:
+    words = [fault.device, fault.kind]
+    words += [str(each) for each in (fault.part, fault.value) if each not in {"", None}]
+    if fault.for_s is not None:
+        words.append(f"for {fault.for_s:g} s")
+    if fault.probability != 1:
+        words.append(f"probability {fault.probability:g}")
     return " ".join(words)

@@ -54,10 +54,6 @@ def _motion(collector: Collector) -> Iterator[Conflict]:
     """The motion as the rig file has it; the supervisor checks each course again before it moves."""
     motion, hexapod = collector.motion, collector.hexapod
     velocity = hexapod.velocity_limit_mm_s
-    travel = hexapod.travel
-    farthest_mm = math.hypot(
-        *(max(map(abs, ends)) for ends in (travel.x_mm, travel.y_mm, travel.z_mm))
-    )
     if motion.kind == "drift" and motion.velocity_mm_s > velocity:
         yield Conflict(
             "the hexapod is not to be faster",
@@ -78,9 +74,24 @@ def _motion(collector: Collector) -> Iterator[Conflict]:
             ),
         )
     for kinds, key in ((("drift", "random"), "range_mm"), (("sine",), "amplitude_mm")):
-        way_mm = getattr(motion, key)
+        way_mm, farthest_mm = getattr(motion, key), _farthest_mm(collector)
         if motion.kind in kinds and way_mm > farthest_mm:
             yield Conflict(
                 "the hexapod's travel is shorter",
                 (at_most(f"motion.{key}", way_mm, farthest_mm),),
             )
+
+
+def _farthest_mm(collector: Collector) -> float:
+    """How far the motion's direction lets the hexapod go to either side, from the middle of its travel."""
+    angle = math.radians(collector.motion.direction_deg)
+    link, azimuth = collector.geometry.link, collector.geometry.link_azimuth
+    elevation = [link[n - 2] * azimuth[n - 1] - link[n - 1] * azimuth[n - 2] for n in range(3)]
+    ways_mm = [
+        (high - low) / 2 / abs(part)
+        for az, el, (low, high) in zip(
+            azimuth, elevation, collector.hexapod.travel.ends, strict=False
+        )
+        if (part := math.cos(angle) * az + math.sin(angle) * el)
+    ]
+    return min(ways_mm)

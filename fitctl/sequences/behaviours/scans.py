@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
 from fitctl.config import ARCSEC_PER_RAD, Rig
 from fitctl.messages.commands import Jog, MoveCollector, Release
 from fitctl.messages.modes import Mode
+from fitctl.model.collector_motion import beyond, course_of
 from fitctl.model.optics import sky_px_per_rad
 from fitctl.sequences import steps
 from fitctl.sequences.behaviours.behaviour import Behaviour, Result
@@ -44,14 +46,20 @@ def _check_collector_scan(step: steps.CollectorScan, rig: Rig, loop_name: str) -
         return [f"rig {rig.name} has no collector that moves"]
     if rig.stellar_loops[loop_name].link is None:
         return [f"loop {loop_name} has no link; its star does not come over the collector"]
-    fastest_mm_s = 2 * math.pi * step.frequency_hz * step.amplitude_mm
-    limit_mm_s = rig.collector.hexapod.velocity_limit_mm_s
-    if fastest_mm_s > limit_mm_s:
-        return [
-            f"the motion reaches {fastest_mm_s:.3g} mm/s; "
-            f"collector.hexapod.velocity_limit_mm_s is {limit_mm_s:g}"
-        ]
-    return []
+    sines = [
+        course_of(rig.collector.motion.changed(_sine(step, axis)), seed=0) for axis in range(2)
+    ]
+    return [problem for sine in sines for problem in beyond(sine, rig.collector)]
+
+
+def _sine(step: steps.CollectorScan, axis: int) -> dict[str, Any]:
+    """The motion along one axis."""
+    return {
+        "kind": "sine",
+        "direction_deg": _DIRECTIONS_DEG[axis],
+        "amplitude_mm": step.amplitude_mm,
+        "frequency_hz": step.frequency_hz,
+    }
 
 
 def _scan_s(step: steps.CollectorScan) -> float:
@@ -68,15 +76,7 @@ def _run_collector_scan(step: steps.CollectorScan, view: View) -> None:
 
 
 def _start_axis(step: steps.CollectorScan, view: View, axis: int) -> None:
-    view.command(
-        MoveCollector(
-            action="start",
-            kind="sine",
-            direction_deg=_DIRECTIONS_DEG[axis],
-            amplitude_mm=step.amplitude_mm,
-            frequency_hz=step.frequency_hz,
-        )
-    )
+    view.command(MoveCollector(action="start", **_sine(step, axis)))
     view.rows["axes"].append((float(axis),))
 
 
@@ -159,6 +159,11 @@ def _check_beam_scan(step: steps.BeamScan, rig: Rig, loop_name: str) -> list[str
     if loop_name not in rig.metrology_loops:
         return [f"beam_scan is for a metrology loop; {loop_name} points a star"]
     problems = []
+    travel_arcsec = rig.metrology_loops[loop_name].siderostat.travel_sky_arcsec
+    if step.span_sky_arcsec > travel_arcsec:
+        problems.append(
+            f"span_sky_arcsec must be at most {travel_arcsec:g}, the siderostat's travel_sky_arcsec"
+        )
     if step.slow_sky_arcsec_s > step.fast_sky_arcsec_s / 2:
         problems.append("slow_sky_arcsec_s must be at most half of fast_sky_arcsec_s")
     most_arcsec = min(rig.camera.width_px, rig.camera.height_px) / sky_px_per_rad(rig)

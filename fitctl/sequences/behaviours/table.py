@@ -20,6 +20,9 @@ BEHAVIOURS: dict[str, Behaviour] = (
     PLAIN | ACQUIRE | POINTING | OPEN_LOOP | PLATE_SCALE | DARK | STARS | TESTBED | SCANS | OVERLAP
 )
 
+LONGEST_STEP_S = 7 * 86_400.0
+"""More is a mistake in one of its keys."""
+
 
 def problems(step: Step, rig: Rig) -> list[str]:
     """What is wrong with a step for a rig, without the instrument: one text each."""
@@ -30,8 +33,14 @@ def problems(step: Step, rig: Rig) -> list[str]:
         return [f"loop is missing: rig {rig.name} has {', '.join(rig.loops)}"]
     if step.loop in rig.metrology_loops and not behaviour.of_beams:
         return [f"{step.step} is for a stellar loop; {step.loop} holds a metrology beam"]
-    found = [behaviour.check(step, rig, name) for name in loops_of(step, rig)]
-    return list(dict.fromkeys(problem for each in found for problem in each))
+    names = loops_of(step, rig)
+    found = [problem for name in names for problem in behaviour.check(step, rig, name)]
+    if found:
+        return list(dict.fromkeys(found))
+    own_s = max(behaviour.own_s(step, rig, name) for name in names)
+    if own_s > LONGEST_STEP_S:
+        return [f"would take {own_s:.4g} s; a step takes at most {LONGEST_STEP_S:g} s"]
+    return []
 
 
 def loops_of(step: Step, rig: Rig) -> list[str]:

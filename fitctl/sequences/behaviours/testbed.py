@@ -9,7 +9,7 @@ import numpy as np
 from fitctl.config import ConfigError, Rig
 from fitctl.messages.commands import MoveCollector
 from fitctl.messages.modes import Mode
-from fitctl.model.collector_motion import course_of
+from fitctl.model.collector_motion import beyond, course_of
 from fitctl.sequences import steps
 from fitctl.sequences.behaviours.behaviour import POWERED, Behaviour, Result, frames_due
 from fitctl.sequences.view import StepFailed, View
@@ -34,13 +34,7 @@ def _check_collector(step: steps.Collector, rig: Rig, _loop_name: str) -> list[s
         course = course_of(rig.collector.motion.changed(step.motion), seed=0)
     except ConfigError as error:
         return [str(error)]
-    limit_mm_s = rig.collector.hexapod.velocity_limit_mm_s
-    if course.velocity_mm_s > limit_mm_s:
-        return [
-            f"the motion reaches {course.velocity_mm_s:.3g} mm/s; "
-            f"collector.hexapod.velocity_limit_mm_s is {limit_mm_s:g}"
-        ]
-    return []
+    return beyond(course, rig.collector)
 
 
 def _collector_s(step: steps.Collector, rig: Rig, _loop_name: str) -> float:

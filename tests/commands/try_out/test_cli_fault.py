@@ -3,9 +3,11 @@
 import json
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
+import zmq
 
 from fitctl.cli import main
 from fitctl.commands.shared.fault_kinds import kinds
@@ -111,6 +113,20 @@ def test_without_mocks_it_says_so(capsys):
         main(["fault", "now", "--set", "mocks.bench_port=0"])
     assert end.value.code == 2
     assert "mocks.bench_port" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("reply", [b"\xc1", b"\x81\xa6active\x91\x80"])
+def test_another_program_at_the_bench_s_port_is_one_line(capsys, reply):
+    with zmq.Context() as context, context.socket(zmq.REP) as other:
+        port = other.bind_to_random_port("tcp://127.0.0.1")
+        answering = threading.Thread(target=lambda: (other.recv(), other.send(reply)))
+        answering.start()
+        with pytest.raises(SystemExit) as end:
+            main(["fault", "now", "--set", f"mocks.bench_port={port}"])
+        answering.join(timeout=10)
+
+    assert end.value.code == 2
+    assert f"what answers at 127.0.0.1:{port} is no bench" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

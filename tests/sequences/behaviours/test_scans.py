@@ -176,6 +176,10 @@ def test_the_course_of_the_beam_has_both_speeds_on_both_axes():
 def test_what_is_wrong_is_one_line_before_anything_moves():
     (fast,) = wrong_with("collector_scan", loop="left", amplitude_mm=20.0)
     assert "collector.hexapod.velocity_limit_mm_s is 8" in fast
+    far = wrong_with("collector_scan", loop="left", amplitude_mm=60.0, frequency_hz=0.01)
+    assert "the motion goes 120 mm from end to end; collector.hexapod.travel.z_mm has 50" in far
+    (long,) = wrong_with("collector_scan", loop="left", frequency_hz=1e-12)
+    assert long == "would take 1.2e+13 s; a step takes at most 604800 s"
     (direct,) = wrong_with("collector_scan", loop="right")
     assert direct == "loop right has no link; its star does not come over the collector"
     (still,) = wrong_with("collector_scan", load_rig(default_rig_path()))
@@ -185,6 +189,8 @@ def test_what_is_wrong_is_one_line_before_anything_moves():
         assert star == f"{name} is for a metrology loop; left points a star"
     (alike,) = wrong_with("beam_scan", loop="metrology", slow_sky_arcsec_s=200.0)
     assert alike == "slow_sky_arcsec_s must be at most half of fast_sky_arcsec_s"
+    (wide,) = wrong_with("beam_scan", loop="metrology", span_sky_arcsec=1e6)
+    assert wide == "span_sky_arcsec must be at most 1500, the siderostat's travel_sky_arcsec"
     (wild,) = wrong_with("beam_scan", loop="metrology", fast_sky_arcsec_s=5000.0)
     assert "too fast for the pace of the telemetry" in wild
 

@@ -209,6 +209,7 @@ HEAD = 'schema_version = 1\nname = "a"\ndescription = "b"\n[[steps]]\nstep = "st
         ("", "there are no stars; give stars, or a file of them"),
         ('file = "none.csv"', "none.csv: no such list of stars"),
         ("stars = []", "stars: "),
+        ('stars = [A]\nfile = "b.csv"', "step 1 (stars): has both stars and file (b.csv)"),
         ("least_held = 2\nstars = [A]", "least_held is 2; there are 1 stars"),
         ("stars = [A, A]", "star alpha: is twice in the list"),
         ("stars = [{name='far', az_sky_arcsec=1100, el_sky_arcsec=0}]", "star far: the search would"),

@@ -100,6 +100,10 @@ def test_what_is_wrong_with_a_motion_is_one_line_before_anything_moves():
     assert wrong_with("collector", action="start", kind="drift", velocity_mm_s=50.0) == [
         "the motion reaches 50 mm/s; collector.hexapod.velocity_limit_mm_s is 8"
     ]
+    slow = {"kind": "sine", "amplitude_mm": 60.0, "frequency_hz": 0.01, "direction_deg": 0.0}
+    assert wrong_with("collector", action="start", **slow) == [
+        "the motion goes 120 mm from end to end; collector.hexapod.travel.y_mm has 100"
+    ]
     assert wrong_with("collector", action="stop", kind="sine") == [
         "kind: only allowed with action start"
     ]
