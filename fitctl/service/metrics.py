@@ -34,6 +34,7 @@ from fitctl.messages.telemetry import Telemetry
 from fitctl.messages.troubles import troubles
 
 HOST = "127.0.0.1"
+STALE_STACKS_S = 62.0  # piezo amplifiers are read once in piezo.poll_s, which is at most a minute
 STALE_S = 2.0  # nothing is told of an instrument that has been silent for so long, but that it is
 _POLL_S = 0.25
 _REQUEST_S = 5.0  # for a whole request and its answer
@@ -232,9 +233,9 @@ def serve_metrics(client: Client, port: int, rig_name: str, stop: threading.Even
         thread.join()
 
 
-def _is_fresh(record: Record | None, newest: Telemetry) -> bool:
+def _is_fresh(record: Record | None, newest: Telemetry, within_s: float = STALE_S) -> bool:
     """Whether a record tells how it is now, and not how it was."""
-    return record is not None and newest.time_s - record.time_s <= STALE_S
+    return record is not None and newest.time_s - record.time_s <= within_s
 
 
 Rows = Iterable[tuple[list[str], float]]
@@ -389,11 +390,12 @@ def _of_devices(newest: Telemetry) -> Iterator[Metric]:
     )
     yield _gauges(
         "fitctl_stack_volts",
-        "Measured at the stack.",
+        "Measured at the stack in the last minute.",
         ["loop", "stack"],
         [
             ([row.loop, str(stack)], value)
             for row in newest.piezo
+            if _is_fresh(row, newest, STALE_STACKS_S)
             for stack, value in enumerate((row.stack1_v, row.stack2_v, row.stack3_v), start=1)
         ],
     )

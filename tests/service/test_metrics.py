@@ -323,3 +323,13 @@ def test_what_was_measured_before_a_stop_or_a_restart_is_not_told_as_newest(pid,
     told = gauges_and_counters(collector)
     assert not told & NEWEST
     assert told >= SUMS
+
+
+@pytest.mark.parametrize(("later_s", "is_told"), [(30.0, True), (70.0, False)])
+def test_stack_voltages_of_an_amplifier_that_is_not_read_any_more_are_not_told(later_s, is_told):
+    collector, message = InstrumentCollector(), FakeSupervisor().message()
+    (reading, *_) = message.piezo
+    later = msgspec.structs.replace(message, time_s=reading.time_s + later_s)
+    collector.accept(later, time.monotonic())
+
+    assert ("fitctl_stack_volts" in gauges_and_counters(collector)) is is_told
