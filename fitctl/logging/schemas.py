@@ -7,6 +7,8 @@ defined once. Frames and events take Foxglove's own messages, which viewers know
 from __future__ import annotations
 
 import base64
+import contextlib
+import json
 import types
 import zlib
 from collections.abc import Callable, Mapping
@@ -149,6 +151,20 @@ def dark_npy_of(metadata: Mapping[str, Mapping[str, str]]) -> bytes | None:
     except (ValueError, zlib.error) as error:
         msg = f"metadata dark: is no compressed dark frame: {error}"
         raise ValueError(msg) from None
+
+
+def designs_of(metadata: Mapping[str, Mapping[str, str]]) -> dict[str, dict[str, Any]]:
+    """The design that each loop began with, by loop; those are left out that are no JSON object.
+
+    Anyone may have written the log: neither the loops' names nor what a design has in it need make sense.
+    """
+    found = {}
+    for loop, text in metadata.get("designs", {}).items():
+        with contextlib.suppress(ValueError, RecursionError):
+            document = json.loads(text)
+            if isinstance(document, dict):
+                found[loop] = document
+    return found
 
 
 def message_class(record_type: type[msgspec.Struct], pool: DescriptorPool) -> type[Message]:

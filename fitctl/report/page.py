@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
+from fitctl.logging.schemas import designs_of
 from fitctl.report import frequency, motion, tables, timeline
 from fitctl.report.drawing import Plot, TimeAxis, time_axis
 from fitctl.report.findings import Findings, LoopFindings, StarFindings
@@ -144,10 +145,7 @@ def sections(findings: Findings) -> list[Section]:
     recorded = [tables.losses(findings), tables.files(run)]
     happened = [tables.modes(findings), tables.events(findings), tables.attempts(findings)]
     rig = run.rig
-    designs = {
-        loop: json.loads(text).get("parameters")
-        for loop, text in run.metadata.get("designs", {}).items()
-    }
+    designs = {loop: each.get("parameters") for loop, each in designs_of(run.metadata).items()}
     return [
         *found,
         Section("Events", [], happened),

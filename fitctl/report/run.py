@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -11,6 +9,7 @@ from typing import NamedTuple
 from fitctl.config import CONTROLLERS, Rig, is_name, rig_from_log
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import LogInfo, log_info
+from fitctl.logging.schemas import designs_of
 
 
 class Run(NamedTuple):
@@ -107,13 +106,11 @@ def _identity(log: LogInfo) -> tuple[str, ...]:
 def _controllers_of(log: LogInfo) -> list[str]:
     """Overrides that name each logged design by what it is; the file that it came from is never read."""
     overrides = []
-    for loop, text in log.metadata.get("designs", {}).items():
-        with contextlib.suppress(ValueError, TypeError, KeyError, RecursionError):
-            name = json.loads(text)["name"]
-            if is_name(loop):
-                # A design of the user's own has a name that no rig file may have; the log has its matrices.
-                known = name if name in CONTROLLERS else CONTROLLERS[0]
-                overrides.append(f"loops.{loop}.vernier.controller={known}")
+    for loop, design in designs_of(log.metadata).items():
+        if is_name(loop):
+            # A design of the user's own has a name that no rig file may have; the log has its matrices.
+            known = design["name"] if design.get("name") in CONTROLLERS else CONTROLLERS[0]
+            overrides.append(f"loops.{loop}.vernier.controller={known}")
     return overrides
 
 

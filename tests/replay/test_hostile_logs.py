@@ -89,6 +89,20 @@ def test_a_loop_s_name_in_the_designs_is_no_path_to_write_to(tmp_path, monkeypat
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("text", ["[", "[1]", '{"name": "\\u001b[31m", "parameters": 7}'])
+def test_designs_that_are_none_end_in_no_traceback(tmp_path, monkeypatch, capsys, text):
+    log = log_of(tmp_path / "run.mcap", hold_a_star, designs={"right": text, "odd\n": text})
+    monkeypatch.chdir(tmp_path)
+    for arguments in (["report"], ["replay", "--set", "loops.right.coarse.gain_rad_per_m=1.0"]):
+        with pytest.raises(SystemExit) as end:
+            main([arguments[0], str(log), *arguments[1:]])
+        assert end.value.code in {0, 1, None}, capsys.readouterr().err
+    printed = capsys.readouterr().out
+    assert "begins with controller eq20, in the log with " in printed
+    assert "\x1b" not in printed
+
+
+@pytest.mark.long
 def test_no_file_that_a_log_names_is_opened(tmp_path, monkeypatch, opened_paths):
     folder = tmp_path / PLANTED
     folder.mkdir()

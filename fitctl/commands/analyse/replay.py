@@ -19,10 +19,11 @@ from fitctl.commands.shared.rig import controller_overrides
 from fitctl.config import ConfigError, Rig, load_rig, rig_from_log
 from fitctl.controllers.design.basis import basis
 from fitctl.controllers.design.choose import design_for
-from fitctl.controllers.design.document import design_json
+from fitctl.controllers.design.document import MATRICES, design_json
 from fitctl.learn.advice import standing
 from fitctl.learn.design_basis import estimated
 from fitctl.logging.reading import LogInfo
+from fitctl.logging.schemas import designs_of
 from fitctl.replay.files import logged_files, missing_dark_file
 from fitctl.replay.log import read_steps, whole_run
 from fitctl.replay.replay import replay as replay_steps
@@ -30,6 +31,7 @@ from fitctl.replay.result import LoopReplay, ReplayResult
 from fitctl.report.gather import Gathered, gather
 from fitctl.report.rejection import held_by_controller
 from fitctl.report.run import find_run
+from fitctl.text import plain
 
 _ROWS = {
     "star_px": ("star's place", "px"),
@@ -274,9 +276,11 @@ def _loop_lines(info: LogInfo, name: str, loop: LoopReplay) -> Iterator[str]:
 
 def _other_designs(info: LogInfo, rig: Rig) -> Iterator[str]:
     """Where the controller to begin with is not that of the log."""
-    for name, text in info.metadata.get("designs", {}).items():
-        then, now = json.loads(text), json.loads(design_json(design_for(rig, name)))
-        if then["name"] != now["name"]:
-            yield f"loop {name} begins with controller {now['name']}, in the log with {then['name']}"
-        elif any(then[matrix] != now[matrix] for matrix in ("a", "b", "c", "d")):
+    logged = designs_of(info.metadata)
+    for name in [name for name in rig.stellar_loops if name in info.metadata.get("designs", {})]:
+        then, now = logged.get(name, {}), json.loads(design_json(design_for(rig, name)))
+        was = plain(str(then.get("name")))
+        if was != now["name"]:
+            yield f"loop {name} begins with controller {now['name']}, in the log with {was}"
+        elif any(then.get(matrix) != now[matrix] for matrix in MATRICES):
             yield f"loop {name}: today's design of {now['name']} is not the log's"
