@@ -45,11 +45,12 @@ def _filled(column: Floats, known: NDArray[np.bool_], draw: np.random.Generator)
     if len(at) <= _ENOUGH * _ORDER:
         return np.asarray(guess + mean)
     for _ in range(_ROUNDS):
-        errors = _prediction_errors(guess)
-        of_unknown, of_known = errors[:, unknown_at], errors[:, at]
-        normal = (of_unknown.T @ of_unknown).tocsc()
-        guess[unknown_at] = spsolve(normal, -(of_unknown.T @ (of_known @ guess[at])))
-    error = errors @ guess
+        of_window = _of_window(guess)
+        normal = _normal(of_window, unknown_at, len(guess))
+        guess[unknown_at] = 0.0  # what the known ones have of the errors
+        by_known = _gradient(of_window, guess)[unknown_at]
+        guess[unknown_at] = spsolve(normal, -by_known)
+    error = np.concatenate(_errors(of_window, guess))
     # The errors of unknown frames were made least: only those of known ones show how large they are.
     variance = error @ error / (len(error) * np.mean(known))
     # Twice, because each error counts forwards and backwards.
@@ -58,15 +59,45 @@ def _filled(column: Floats, known: NDArray[np.bool_], draw: np.random.Generator)
     return np.asarray(guess + mean)
 
 
-def _prediction_errors(series: Floats) -> sp.csc_matrix:
-    """The matrix that turns a series into its prediction errors, from frames before and from frames after."""
-    windows = np.lib.stride_tricks.sliding_window_view(series, _ORDER + 1)
-    before, last = windows[:, :-1], windows[:, -1]
-    weights = np.linalg.lstsq(before.T @ before, before.T @ last, rcond=None)[0]
-    of_window = np.append(-weights, 1.0)
-    shape = (len(windows), len(series))
-    both = [
-        sp.diags(list(each), range(_ORDER + 1), shape=shape)
-        for each in (of_window, of_window[::-1])
-    ]
-    return sp.vstack(both).tocsc()
+def _of_window(series: Floats) -> Floats:
+    """Factors of `_ORDER` frames and the one after them in the error of its prediction."""
+    before = np.ascontiguousarray(np.lib.stride_tricks.sliding_window_view(series, _ORDER)[:-1])
+    weights = np.linalg.lstsq(before.T @ before, before.T @ series[_ORDER:], rcond=None)[0]
+    return np.append(-weights, 1.0)
+
+
+def _errors(of_window: Floats, series: Floats) -> tuple[Floats, Floats]:
+    """The prediction's errors in each window of a series, from frames before and from frames after."""
+    forwards, backwards = of_window[::-1], of_window  # a convolution turns them round
+    return np.convolve(series, forwards, "valid"), np.convolve(series, backwards, "valid")
+
+
+def _gradient(of_window: Floats, series: Floats) -> Floats:
+    """How each frame of a series changes half the sum of the squared errors."""
+    forwards, backwards = _errors(of_window, series)
+    return np.convolve(forwards, of_window) + np.convolve(backwards, of_window[::-1])
+
+
+def _normal(of_window: Floats, unknown_at: NDArray[np.intp], frames: int) -> sp.csc_matrix:
+    """How the unknown frames change each other's :func:`_gradient`: those in one window, by what it sums up."""
+    # Of both directions, by the frames' places in the window: sums over all windows that hold both frames.
+    both = np.outer(of_window, of_window) + np.outer(of_window[::-1], of_window[::-1])
+    sums = np.zeros((_ORDER + 1, _ORDER + 2))
+    for lag in range(_ORDER + 1):
+        sums[lag, 1 : _ORDER + 2 - lag] = np.cumsum(np.diagonal(both, lag))
+    last = np.searchsorted(unknown_at, unknown_at + _ORDER, side="right")
+    rows, columns, values = [], [], []
+    for apart in range(int((last - np.arange(len(unknown_at))).max())):
+        one = np.flatnonzero(np.arange(len(unknown_at)) + apart < last)
+        first_at, second_at = unknown_at[one], unknown_at[one + apart]
+        lags = second_at - first_at
+        # Windows begin from 0 to frames - _ORDER - 1: the first frame's places in those that hold both.
+        least = np.maximum(0, first_at - (frames - _ORDER - 1))
+        most = np.minimum(_ORDER - lags, first_at)
+        value = sums[lags, most + 1] - sums[lags, least]
+        rows += [one, one + apart] if apart else [one]
+        columns += [one + apart, one] if apart else [one]
+        values += [value, value] if apart else [value]
+    shape = (len(unknown_at), len(unknown_at))
+    entries = np.concatenate(values), (np.concatenate(rows), np.concatenate(columns))
+    return sp.csc_matrix(entries, shape=shape)

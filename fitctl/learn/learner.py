@@ -107,14 +107,18 @@ class Learner:
             self._unsettled_s = tick.time_s
         elif tick.number >= 0 and tick.star_visible and tick.time_s - self._unsettled_s >= SETTLE_S:
             if tick.time_s - self._last_s > WINDOW_S:
-                self._added = self._new = 0
+                self.forget()
                 self._classified = []
-                self._due_after = self._first
             self._last_s = tick.time_s
             row = self._added % len(self._ring)
             self._ring[row] = [getattr(tick, name) for name in _KEPT]
             self._added += 1
             self._new += 1
+
+    def forget(self) -> None:
+        """What was added is of another light: begin again."""
+        self._added = self._new = 0
+        self._due_after = self._first
 
     @property
     def frames(self) -> int:
@@ -126,14 +130,27 @@ class Learner:
         """There are enough new frames for a report."""
         return self._new >= self._due_after
 
-    def report(self, present: Design) -> LearnerReport:
-        """Estimate and design, with `present` in force; a report without a result has the reason."""
+    def newest(self) -> Floats:
+        """A copy of the frames that are kept, the oldest first, for :meth:`report` on another thread."""
+        oldest = self._added % len(self._ring) if self._added > len(self._ring) else 0
+        return np.roll(self._ring[: self.frames], -oldest, axis=0)
+
+    def report(self, present: Design, frames: Floats | None = None) -> LearnerReport:
+        """Estimate and design, with `present` in force; a report without a result has the reason.
+
+        `frames` are those that :meth:`newest` gave; without them, it is asked now.
+        """
         self._begin_report()
+        table = self.newest() if frames is None else frames
         try:
             with solving("learn", self._loop_name, "the next report may have one"):
-                return self._report(self._advice(present))
+                return self._report(self._advice(present, table))
         except ConfigError as error:
             return self._without_design(str(error))
+        except MemoryError:
+            return self._without_design(
+                "learn: the learner's process has too little memory for a report"
+            )
 
     def failed(self, reason: str) -> LearnerReport:
         """Instead of :meth:`report`, where the design in force is not known."""
@@ -151,9 +168,7 @@ class Learner:
     def _begin_report(self) -> None:
         self._new, self._due_after = 0, round(EVERY_S / self._period_s)
 
-    def _advice(self, present: Design) -> Advice:
-        oldest = self._added % len(self._ring) if self._added > len(self._ring) else 0
-        table = np.roll(self._ring[: self.frames], -oldest, axis=0)
+    def _advice(self, present: Design, table: Floats) -> Advice:
         ticks = dict(zip(_KEPT, table.T, strict=True))
         pieces = pieces_of(ticks["mid_exposure_s"], np.ones(len(table), bool))
         pieces, others = by_rate(ticks["mid_exposure_s"], pieces, self._period_s)

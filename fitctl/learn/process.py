@@ -10,14 +10,20 @@ import threading
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 
+import numpy as np
+from numpy.typing import NDArray
+
 from fitctl.config import ConfigError, Rig
+from fitctl.controllers.centroid import sensor_noise_px
 from fitctl.controllers.design.choose import design_for
 from fitctl.learn.learner import Learner
+from fitctl.loop.learning import MOST_NOISE_RATIO
 from fitctl.messages.client import Client
 from fitctl.messages.commands import LearnerReport
 from fitctl.messages.telemetry import LoopState, Telemetry
 from fitctl.processes import give_way
 
+Floats = NDArray[np.float64]
 NICENESS = 10
 """With 19, a learner on a busy machine gets too little of the processor to follow the telemetry at all."""
 MOST_BYTES = 1 << 30
@@ -33,27 +39,47 @@ class LoopLearner:
         self._rig = rig
         self._learner = Learner(rig, loop_name)
         self._state: LoopState | None = None
-        self._report: Future[LearnerReport] | None = None
+        self._key = ""  # of the design in force
+        loop = rig.stellar_loops[loop_name]
+        self._rig_noise_px = sensor_noise_px(rig.camera, loop, loop.star_flux_dn)
+        self._noise_px = self._rig_noise_px
+        self._report: tuple[Future[LearnerReport], str] | None = (
+            None  # with the key at its beginning
+        )
 
     def hear(self, telemetry: Telemetry, state: LoopState) -> None:
         """One message."""
         self._state = state
-        key = f"{state.design} {state.controller_digest} {state.noise_px}"
-        self._learner.watch(key, telemetry.time_s)
+        is_learnt = state.learning is not None and state.learning.design_json
+        if not (is_learnt or self._is_same_light(state.noise_px)):
+            self._learner.forget()
+        self._key = f"{state.design} {state.controller_digest} {state.noise_px}"
+        self._learner.watch(self._key, telemetry.time_s)
         for tick in telemetry.ticks:
             if tick.loop == self.loop_name:
                 self._learner.add(tick)
 
+    def _is_same_light(self, noise_px: float | None) -> bool:
+        """Whether a design is for about the same noise of the sensor as the last that was not learnt."""
+        before_px, self._noise_px = self._noise_px, noise_px or self._rig_noise_px
+        least_px, most_px = sorted([before_px, self._noise_px])
+        return most_px <= MOST_NOISE_RATIO * least_px
+
     def work(self, executor: ThreadPoolExecutor) -> LearnerReport | None:
-        """Begin a report that is due, beside the messages; the one that is ready."""
+        """Begin a report that is due, beside the messages; the one that is ready.
+
+        One that was compared with a design that is not in force any more is left out.
+        """
         ready = None
-        if self._report is not None and self._report.done():
-            ready, self._report = self._report.result(), None
+        if self._report is not None and self._report[0].done():
+            (future, key), self._report = self._report, None
+            ready = future.result() if key == self._key else None
         if self._report is None and self._state is not None and self._learner.due:
-            self._report = executor.submit(self._make, self._state)
+            begun = executor.submit(self._make, self._state, self._learner.newest())
+            self._report = begun, self._key
         return ready
 
-    def _make(self, state: LoopState) -> LearnerReport:
+    def _make(self, state: LoopState, frames: Floats) -> LearnerReport:
         try:
             present = design_for(self._rig, self.loop_name, state.design, state.noise_px)
         except ConfigError as error:  # such as a design file that is gone
@@ -63,7 +89,7 @@ class LoopLearner:
                 f"{state.controller_file} has changed since the loop loaded it; to learn, load it again with "
                 "fitctl send controller"
             )
-        return self._learner.report(present)
+        return self._learner.report(present, frames)
 
 
 def serve_learning(client: Client, rig: Rig, stop: threading.Event) -> None:

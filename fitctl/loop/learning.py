@@ -30,9 +30,13 @@ PAUSE_S, MOST_PAUSE_S = 60.0, 960.0
 _RMS_LIMITS = ((0.3, 2.0), (10.0, 1.25))
 # A louder night is louder for the design before, too. Beyond so many times, it may as well be a fault.
 _LOUDER = 2.0
+MOST_NOISE_RATIO = 1.1
+"""Another light of the star is another noise of the sensor. One that differs by less is not worth another
+design: minimum-variance leaves 0.3 % more at most."""
 STILL_PX_PER_S = 0.05
 """A target that moves slower is at rest."""
 _LONGEST_GAP = 5.5  # in frame periods: the comparison of designs bears so few missing frames
+_MOST_PX = 1e6  # of a residual in a report: no frame is so wide
 _NEWS = 0.1  # by which part a gain must differ from the one last reported to be reported again
 
 
@@ -65,6 +69,7 @@ class Learning:
         self._means_px2 = [[0.0, 0.0] for _ in _RMS_LIMITS]
         self._before_px2 = [[0.0, 0.0] for _ in _RMS_LIMITS]
         self._limit_px = math.inf
+        self._judged_from_s = -math.inf
         self._by_hand = False
         self._calm_since_s: float | None = None
         self._paused_until_s = -math.inf
@@ -171,8 +176,7 @@ class Learning:
             for seen in recent:
                 self._comparison.observe(seen.error_px, seen.mirror_rad, seen.motor_rad)
         self._limit_px = max(report.measured_px, report.learnt_camera_px)
-        for means in (*self._means_px2, *self._before_px2):
-            means[:] = [report.learnt_camera_px**2] * 2
+        self._judge_from(-math.inf, report)
 
     def fell_back(self, reason: str, now_s: float) -> None:
         """The previous design is in force again."""
@@ -198,7 +202,7 @@ class Learning:
         exposed_s : float
             Of mid-exposure. Nothing is compared or changed while the camera runs at another rate.
         error_px : tuple of float or None
-            None without a star.
+            None without a star; a few such frames count as missing.
         target_px : tuple of float
             As the prefilter has it.
         stages_rad : tuple of array, shape (2,)
@@ -209,14 +213,21 @@ class Learning:
         hindered : bool
             The loop is not in VERNIER, waits, or an interlock keeps the stages from following the star.
         """
-        hindered = self._frame_rate.is_other(exposed_s) or hindered
+        is_other_rate = self._frame_rate.is_other(exposed_s)
         moved = has_moved(target_px, self._last_target_px, self._period_s)
         self._last_target_px = target_px
-        if now_s - self._last_s > self._longest_gap_s:
+        if error_px is None and not hindered:  # as if the frame were missing
+            self._calm_since_s = None
+            return ""
+        is_gap = now_s - self._last_s > self._longest_gap_s
+        self._last_s = now_s
+        if is_gap or hindered:
+            # The star is caught again first: that says nothing of the design.
+            self._judge_from(now_s + CALM_S, self.in_force)
+        if is_gap:
             self._calm_since_s = None
             self._restart_comparison()
-        self._last_s = now_s
-        if hindered or error_px is None or moved:
+        if hindered or is_other_rate or error_px is None or moved:
             self._calm_since_s = None
             self._restart_comparison()
             return ""
@@ -230,14 +241,23 @@ class Learning:
         if self._comparison is not None and not saturated:
             self._comparison.observe(error_px, *stages_rad)
             error_px = self._comparison.error_px
-        return self._why_back(error_px)
+        return self._why_back(error_px, now_s)
+
+    def _judge_from(self, time_s: float, in_force: LearnerReport | None) -> None:
+        """Compare the design's residual with its limit from a time on, as if it had left what it promised."""
+        self._judged_from_s = time_s
+        if in_force is not None:
+            for means in (*self._means_px2, *self._before_px2):
+                means[:] = [in_force.learnt_camera_px**2] * 2
 
     def _restart_comparison(self) -> None:
         if self._comparison is not None:
             self._comparison.restart()
 
-    def _why_back(self, error_px: AzEl) -> str:
+    def _why_back(self, error_px: AzEl, now_s: float) -> str:
         worse = "" if self._comparison is None else self._comparison.why_back
+        if now_s < self._judged_from_s:
+            return worse
         before_px = None if self._comparison is None else self._comparison.before_error_px
         for (over_s, factor), keep, means, before in zip(
             _RMS_LIMITS, self._keep, self._means_px2, self._before_px2, strict=True
@@ -314,8 +334,10 @@ def refused_report(report: LearnerReport) -> str:
         report.measured_px,
         report.noise_px,
     )
-    if not all(math.isfinite(px) and px >= 0 for px in figures_px):
-        return f"a learner's report needs finite residuals, got {figures_px}"
+    if not all(0 <= px <= _MOST_PX for px in figures_px):  # NaN is not
+        return f"a learner's report needs residuals of 0 to {_MOST_PX:g} px, got {figures_px}"
+    if not (math.isfinite(report.evaluated_s) and math.isfinite(report.classifying_rate_hz)):
+        return "a learner's report needs finite times and rates"
     if report.design_json and not report.design_json.startswith("{"):
         # Nothing else: a name with .py would be a file to run, and reports are also read from logs.
         return "a learner's report has the parameters of a design, a JSON object; this report has other text"

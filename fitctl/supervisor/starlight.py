@@ -6,14 +6,13 @@ from concurrent.futures import Future
 
 from fitctl.config import Rig
 from fitctl.controllers.pair import Design
+from fitctl.loop.learning import MOST_NOISE_RATIO
 from fitctl.loop.stellar import StellarLoop
 from fitctl.messages.modes import WITH_WINDOW
 from fitctl.stages.journal import Journal, error_text
 
 FIRST_S, EVERY_S = 1.0, 20.0
 """The light is the mean of so long: once the star is found or the design changes, and from then on."""
-MOST_RATIO = 1.1
-"""A noise that differs by less is not worth another design: minimum-variance leaves 0.3 % more at most."""
 
 
 def noise_ratio(design: Design, noise_px: float) -> float:
@@ -61,7 +60,7 @@ class Starlight:
         flux_dn = self._sum_dn / self._frames
         self._frames, self._needed, self._sum_dn = 0, self._every, 0.0
         noise_px = loop.star_finder.noise_px(flux_dn)
-        if noise_ratio(self._design, noise_px) <= MOST_RATIO:
+        if noise_ratio(self._design, noise_px) <= MOST_NOISE_RATIO:
             return None
         self._remade = self._design
         return noise_px

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fitctl.controllers.spot_fit import NODES, SpotFit, gaussian_shape
+from fitctl.controllers.spot_fit import NODES, SpotFit, gaussian_shape, spot_fit
 
 DIAMETER_PX, NOISE_DN, FLUX_DN = 3.0, 20.0, 28_000.0  # FIT's star
 FIT = SpotFit(DIAMETER_PX, NOISE_DN, FLUX_DN)
@@ -208,3 +208,9 @@ def test_two_steps_are_enough_from_nearly_half_a_pixel_away(az, el, az_off, el_o
 
 def test_without_light_there_is_no_spot():
     assert FIT.place(-light(0.0, 0.0), 0.0, 0.0) is None
+
+
+def test_a_star_of_another_light_needs_no_new_fit_unless_photons_count():
+    """To make one takes half a frame, on the thread of the tick."""
+    assert spot_fit(3.0, 10.0, 28_000.0, None) is spot_fit(3.0, 10.0, 14_000.0, None)
+    assert spot_fit(3.0, 10.0, 28_000.0, 1.0) is not spot_fit(3.0, 10.0, 14_000.0, 1.0)

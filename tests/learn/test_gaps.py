@@ -1,11 +1,13 @@
 """Frames of a series that are not known."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fitctl.learn.gaps import filled
+from fitctl.learn.gaps import _gradient, _normal, filled
 
 FRAMES, PERIOD_S, NOISE_PX = 3000, 0.02, 0.01
 
@@ -84,3 +86,34 @@ def test_a_series_with_hardly_a_known_frame_is_bridged_by_straight_lines():
     straight_px = np.outer(np.arange(200.0), [1.0, -2.0])
     known = known_but(np.arange(50, 150), frames=200)
     np.testing.assert_allclose(filled(spoilt(straight_px, known), known), straight_px, atol=1e-9)
+
+
+@pytest.mark.long
+def test_a_window_of_frames_at_500_hz_takes_little_memory():
+    draw = np.random.default_rng(3)
+    series = 0.01 * np.cumsum(draw.normal(size=(120_000, 2)), axis=0)
+    known = draw.random(len(series)) > 0.002
+    tracemalloc.start()
+    try:
+        filled(series, known)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+
+    assert peak < 200e6
+
+
+def test_unknown_frames_make_the_errors_of_the_prediction_least():
+    """As the matrix of all errors, solved by least squares, has them."""
+    draw = np.random.default_rng(4)
+    series, unknown_at = draw.normal(size=200), np.array([0, 3, 50, 51, 110, 199])
+    factors = draw.normal(size=61)
+    of_windows = np.zeros((2 * 140, 200))
+    for window in range(140):
+        of_windows[window, window : window + 61] = factors
+        of_windows[140 + window, window : window + 61] = factors[::-1]
+
+    normal = _normal(factors, unknown_at, 200).toarray()
+    columns = of_windows[:, unknown_at]
+    assert normal == pytest.approx(columns.T @ columns)
+    assert _gradient(factors, series) == pytest.approx(of_windows.T @ (of_windows @ series))

@@ -190,6 +190,42 @@ def test_the_process_knows_the_learnt_design_in_force(rig, ticks):
     )  # it was made for a night without the line
 
 
+@pytest.mark.long
+def test_a_report_on_a_design_that_is_not_in_force_any_more_is_left_out(rig, ticks):
+    heard = message(ticks, controller="minimum-variance")
+    learner = LoopLearner(rig, "right")
+    learner.hear(heard, heard.loops[0])
+    with ThreadPoolExecutor(1) as executor:
+        learner.work(executor)
+        later = message([], controller="eq20")
+        learner.hear(later, later.loops[0])
+        executor.submit(int).result()
+        assert learner.work(executor) is None
+
+
+def test_another_light_of_the_star_begins_a_new_night(rig, vernier, monkeypatch):
+    monkeypatch.setattr("fitctl.learn.learner.FIRST_S", 1.0)
+    learner = LoopLearner(rig, "right")
+    for noise_px, is_due in ((None, True), (0.036, False), (0.037, False)):
+        heard = message(vernier[:500] if is_due else [], noise_px=noise_px)
+        learner.hear(heard, heard.loops[0])
+        assert learner._learner.due is is_due
+    later = message(vernier[500:], noise_px=0.037)
+    learner.hear(later, later.loops[0])
+    assert learner._learner.due
+
+
+def test_a_report_for_which_memory_does_not_suffice_says_so(rig, vernier, monkeypatch):
+    def too_large(*_):
+        raise MemoryError
+
+    monkeypatch.setattr("fitctl.learn.learner.rebuild", too_large)
+    report = reported(rig, vernier, monkeypatch, controller="minimum-variance")
+
+    assert report.design_json == ""
+    assert "too little memory" in report.text
+
+
 def reported(rig, vernier, monkeypatch, **state):
     """The first report, on few frames; there is no second one."""
     monkeypatch.setattr("fitctl.learn.learner.FIRST_S", 1.0)

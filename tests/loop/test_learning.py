@@ -18,6 +18,7 @@ from fitctl.loop.learning import CALM_S, PAUSE_S, Learning
 from fitctl.messages.commands import (
     Acquire,
     LearnerReport,
+    Release,
     SetController,
     SetTarget,
     Standby,
@@ -156,6 +157,9 @@ def test_parameters_without_margins_are_refused():
         {"present_px": math.nan},
         {"learnt_camera_px": math.inf},
         {"learnt_px": 0.2},
+        {"noise_px": 1e200},
+        {"learnt_camera_px": 1e200},
+        {"classifying_rate_hz": math.nan},
     ],
 )
 def test_a_report_that_cannot_be_is_refused_and_changes_nothing(shaken, figures):
@@ -365,6 +369,60 @@ def test_a_design_that_is_only_a_little_worse_is_left_too():
     _, back = night.changes()
     assert (back.source, back.target) == ("learnt", "minimum-variance")
     assert "the design before would have left" in back.reason
+
+
+def learnt_design_at_work(**more):
+    """On the paper's night, of which it leaves what it promised."""
+    night = Night("loops.right.vernier.controller=minimum-variance")
+    good = parameters_json(design_with_margins(PAPER))
+    values = {"measured_px": 0.0165, "learnt_camera_px": 0.0165, "design_json": good} | more
+    night.report(**values)
+    night.simulation.run(10.0)
+    assert night.loop.controller == "learnt"
+    return night
+
+
+@pytest.mark.long
+def test_a_star_that_is_caught_again_is_no_reason_to_go_back():
+    night = learnt_design_at_work()
+    for command in (Release(), Acquire()):
+        assert night.simulation.command(command).accepted
+        night.simulation.run(1.0)
+    while night.loop.mode is not Mode.VERNIER:
+        night.simulation.run(0.1)
+    night.simulation.run(6.0)
+
+    assert len(night.changes()) == 1
+
+
+@pytest.mark.long
+def test_a_star_of_another_light_gets_the_design_before_without_a_pause():
+    night = learnt_design_at_work()
+    assert night.simulation.command(Release()).accepted
+    night.simulation.run(1.0)
+    assert night.simulation.command(Acquire(star_flux_dn=14_000.0)).accepted
+    *_, back = night.changes()
+
+    assert (back.source, back.target) == ("learnt", "minimum-variance")
+    assert "the learnt design is for another light" in back.reason
+    assert night.loop.learning.wants_change(math.inf) is False  # not calm, but not paused either
+    assert night.loop.state(0.0).learning.state != "fell back"
+
+
+@pytest.mark.long
+def test_single_frames_without_the_star_do_not_keep_a_worse_design_in_force():
+    night = Night("loops.right.vernier.controller=minimum-variance")
+    night.report(design_json=TIMID, measured_px=0.02, learnt_camera_px=0.02)
+    observe, frames = night.loop.learning.observe, iter(range(10_000))
+
+    def some_without(now_s, exposed_s, error_px, *more, **others):
+        lost = next(frames) % 600 == 599
+        return observe(now_s, exposed_s, None if lost else error_px, *more, **others)
+
+    night.loop.learning.observe = some_without
+    night.simulation.run(60.0)
+    _, back = night.changes()
+    assert (back.source, back.target) == ("learnt", "minimum-variance")
 
 
 @pytest.mark.long

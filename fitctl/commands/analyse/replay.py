@@ -160,7 +160,7 @@ def _left(gathered: Gathered, name: str, asked: Rig) -> Left:
             measured[held.controller] = (held.residual["az"].rms, held.residual["el"].rms)
         _, truth, _ = estimated(loop.series, basis(gathered.run.rig, name))
         designs = (loop.present, design_for(asked, name))
-        found = {design.name: standing(design, truth) for design in designs}
+        found = {design.title: standing(design, truth) for design in designs}
     except ConfigError as error:
         return Left(name, measured, {}, {}, str(error))
     return Left(

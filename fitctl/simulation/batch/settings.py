@@ -22,6 +22,7 @@ from fitctl.controllers.photodiodes import PhotodiodeArray
 from fitctl.controllers.position_servo import position_servo
 from fitctl.controllers.spiral import plan_beam_spiral, plan_spiral
 from fitctl.controllers.spot_fit import PLACES
+from fitctl.loop.learning import MOST_NOISE_RATIO
 from fitctl.loop.metrology import PULL_IN
 from fitctl.loop.pointing import Pointing
 from fitctl.loop.search.star import NEAR
@@ -58,11 +59,11 @@ from fitctl.simulation.statistics import SETTLE_S, TILT_EVERY, motion_start_s
 from fitctl.stages.injector import PERIOD_S
 from fitctl.stages.mirror import HISTORY_S as MIRROR_HISTORY_S
 from fitctl.stages.servo import FOLLOWING_S, HISTORY_S
-from fitctl.supervisor.starlight import MOST_RATIO, noise_ratio
+from fitctl.supervisor.starlight import noise_ratio
 
 Floats = NDArray[np.float64]
 _NO_FIT = np.zeros((PLACES, PLACES, 3, SIDE_PX**2))
-_MOST_NOISE_RATIO = 0.98 * MOST_RATIO  # beyond it, a loop may design for the measured light
+_MOST_NOISE_RATIO = 0.98 * MOST_NOISE_RATIO  # beyond it, a loop may design for the measured light
 _OWN_SIGMAS = 10.0  # a spot is never farther than this from where it should be beside the first
 
 
