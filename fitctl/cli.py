@@ -161,7 +161,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Entry point: what an operator can mend is one line for each thing, and exit status 2."""
     given = sys.argv[1:] if arguments is None else arguments
     if not given and "_FITCTL_COMPLETE" not in os.environ:
-        say_lines(welcome(Path.cwd()))
+        say_lines(welcome(Path()))
         return
     try:
         status = app(given, prog_name="fitctl", standalone_mode=False)

@@ -36,11 +36,14 @@ AnyLoop = Annotated[
 ]
 
 
+RIG_NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,40}$"
+
+
 class Rig(Settings):
     """A whole rig file. ``plant`` and ``mocks`` are for mock rigs; a rig of real hardware leaves them out."""
 
     schema_version: Literal[2]  # SCHEMA_VERSION
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,40}$")]
+    name: Annotated[str, Field(pattern=RIG_NAME)]
     description: str
     optics: Optics
     camera: Camera

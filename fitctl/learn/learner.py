@@ -103,9 +103,11 @@ class Learner:
         target_px = tick.target_az_px, tick.target_el_px
         moved = has_moved(target_px, self._target_px, self._period_s)
         self._target_px = target_px
-        if tick.mode != Mode.VERNIER.name or tick.fsm_saturated or tick.held or moved:
+        has_frame = tick.number >= 0  # else the stages are held for want of one, until the next
+        held = tick.held and has_frame
+        if tick.mode != Mode.VERNIER.name or tick.fsm_saturated or held or moved:
             self._unsettled_s = tick.time_s
-        elif tick.number >= 0 and tick.star_visible and tick.time_s - self._unsettled_s >= SETTLE_S:
+        elif has_frame and tick.star_visible and tick.time_s - self._unsettled_s >= SETTLE_S:
             if tick.time_s - self._last_s > WINDOW_S:
                 self.forget()
                 self._classified = []

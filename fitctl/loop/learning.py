@@ -336,8 +336,6 @@ def refused_report(report: LearnerReport) -> str:
     )
     if not all(0 <= px <= _MOST_PX for px in figures_px):  # NaN is not
         return f"a learner's report needs residuals of 0 to {_MOST_PX:g} px, got {figures_px}"
-    if not (math.isfinite(report.evaluated_s) and math.isfinite(report.classifying_rate_hz)):
-        return "a learner's report needs finite times and rates"
     if report.design_json and not report.design_json.startswith("{"):
         # Nothing else: a name with .py would be a file to run, and reports are also read from logs.
         return "a learner's report has the parameters of a design, a JSON object; this report has other text"

@@ -78,6 +78,14 @@ def test_frames_of_a_disturbed_loop_are_left_out(rig, vernier, disturbed):
     assert learner.frames == 0
 
 
+def test_a_tick_without_a_frame_disturbs_none_of_the_others(rig, vernier):
+    """At 500 Hz a busy computer has one every few seconds; until the next frame, the stages are held."""
+    late = [msgspec.structs.replace(tick, number=-1, held=True) for tick in vernier[100::100]]
+    ticks = sorted([*vernier, *late], key=lambda tick: tick.time_s)
+
+    assert fed(rig, ticks).frames == fed(rig, vernier).frames
+
+
 def test_after_a_step_of_the_target_frames_are_left_out(rig, vernier):
     before, after = vernier[:1000], vernier[1000:1500]
     stepped = [msgspec.structs.replace(tick, target_az_px=25.0) for tick in after]

@@ -159,7 +159,6 @@ def test_parameters_without_margins_are_refused():
         {"learnt_px": 0.2},
         {"noise_px": 1e200},
         {"learnt_camera_px": 1e200},
-        {"classifying_rate_hz": math.nan},
     ],
 )
 def test_a_report_that_cannot_be_is_refused_and_changes_nothing(shaken, figures):

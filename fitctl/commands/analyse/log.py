@@ -229,12 +229,20 @@ def verify(
 ) -> None:
     """Check that logs are whole.
 
-    Reads each log from end to end: checksums, index, order, every message. Exit status 1 if one is damaged.
+    Reads each log from end to end: checksums, index, order, every message. Exit status 1 if one is damaged, 2
+    if one cannot be read or is no log.
     """
-    problems, documents = 0, []
+    status, documents = 0, []
     for log in chosen_logs("log verify", logs, rig, latest=latest):
-        verdict = verifying.verify(log)
-        problems += len(verdict.problems)
+        try:
+            verdict = verifying.verify(log)
+        except LogError as error:
+            say(str(error), err=True)
+            status = UNUSABLE
+            documents.append({"path": str(log), "whole": False, "problems": [str(error)]})
+            continue
+        if verdict.problems:
+            status = max(status, FAILED)
         if as_json:
             documents.append({"path": str(log), "whole": not verdict.problems, **asdict(verdict)})
             continue
@@ -246,7 +254,7 @@ def verify(
             say(f"  {problem}")
     if as_json:
         say(to_json(documents))
-    raise typer.Exit(FAILED if problems else 0)
+    raise typer.Exit(status)
 
 
 @app.command()

@@ -114,17 +114,9 @@ def identify(
     if not step or loop not in settings.loops:
         require_loop("identify", settings, loop)
     source = Source(log, simulated, mock, seed)
-    stem = f"{settings.name}-{loop}-{what}"
-    fragment_path = out or Path(f"{stem}.toml")
-    _require_output(fragment_path)
-    plot_path = plot or fragment_path.with_suffix(".png")
-    if plot_path.suffix not in _PLOT_SUFFIXES:
-        msg = f"identify: {plot_path}: plots are {' or '.join(_PLOT_SUFFIXES)}; name another with --plot"
-        raise ConfigError(msg)
-    if plot_path.resolve() == fragment_path.resolve():
-        msg = f"identify: {plot_path}: is both the fragment and the plot; name another with --out or --plot"
-        raise ConfigError(msg)
-    _require_output(plot_path)
+    by = f"fitctl identify {what}{' --simulate' * simulated}{' --mocks' * mock}"
+    fragment_path = out or Path(f"{settings.name}-{loop}-{what}.toml")
+    plot_path = _plot_path(fragment_path, plot, what, by)
     try:
         with ended_by_signals(interrupt), progress_line(f"identify {what}") as progress:
             finding = _finding(
@@ -132,9 +124,7 @@ def identify(
             )
         # The plot first: it shows why, where there is nothing to write for the rig.
         _write(plot_path, lambda: finding.plot(plot_path))
-        text = fragment_text(
-            f"fitctl identify {what}", settings, finding.lines(), finding.fragment()
-        )
+        text = fragment_text(by, settings, finding.lines(), finding.fragment())
     except (IdentifyError, ConnectionError, demos.DemoError) as error:
         say(f"identify {what}: {error}", err=True)
         raise typer.Exit(FAILED) from None
@@ -149,11 +139,41 @@ def identify(
     say(f"written: {fragment_path} (name it in the rig file's include list), {plot_path}")
 
 
-def _require_output(path: Path) -> None:
-    """Refuse, before minutes of an experiment, what could not be written after them."""
+def _plot_path(fragment: Path, wanted: Path | None, what: str, by: str) -> Path:
+    """Where the plot goes; refuses, before minutes of an experiment, what could not be written after them."""
+    _require_writable(fragment)
+    _require_own(fragment, what, by)
+    plot = wanted or fragment.with_suffix(".png")
+    if plot.suffix not in _PLOT_SUFFIXES:
+        msg = f"identify: {plot}: plots are {' or '.join(_PLOT_SUFFIXES)}; name another with --plot"
+        raise ConfigError(msg)
+    if plot.resolve() == fragment.resolve():
+        msg = f"identify: {plot}: is both the fragment and the plot; name another with --out or --plot"
+        raise ConfigError(msg)
+    _require_writable(plot)
+    return plot
+
+
+def _require_writable(path: Path) -> None:
     if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
         msg = f"identify: {path}: nothing can be written there; name another with --out or --plot"
         raise ConfigError(msg)
+
+
+def _require_own(path: Path, what: str, by: str) -> None:
+    """Refuse to replace what is no fragment of this command, and what is measured with what is simulated."""
+    if not path.exists():
+        return
+    with path.open("rb") as file:
+        head = file.readline(200).decode(errors="replace")
+    measured = f"fitctl identify {what}"
+    if head.startswith(f"# Written by `{by}`") or (by == measured and f"`{measured}" in head):
+        return
+    msg = (
+        f"identify: {path}: exists already, and was not written by {by}; name another file with --out, or "
+        "move that one away"
+    )
+    raise ConfigError(msg)
 
 
 def _write(path: Path, write: Callable[[], object]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import tomllib
 from pathlib import Path
@@ -25,6 +26,7 @@ from fitctl.config.new_rig import (
     forms,
     new_rig_text,
 )
+from fitctl.config.rig import RIG_NAME
 from fitctl.config.simulated import mixture_warnings
 
 _FORM = "KIND:ADDRESS"
@@ -104,11 +106,18 @@ def init(
         say("Name your hardware. Press Enter for the value in brackets.")
         _show_serial_ports()
         name = name or typer.prompt("Name of the rig", default=file.stem)
+    name = name or file.stem
+    if not re.fullmatch(RIG_NAME, name):
+        msg = (
+            f"init: name {name!r}: expected letters, digits, '_', '.' and '-', at most 41 of them, the first a "
+            "letter or digit; give another with --name"
+        )
+        raise ConfigError(msg)
     devices = {
         device: choice or (Chosen() if mocks else _ask(base, device))
         for device, choice in given.items()
     }
-    text = new_rig_text(base, name or file.stem, devices)
+    text = new_rig_text(base, name, devices)
     rig = rig_from_document(tomllib.loads(text), str(file))
     _write(file, text)
     simulated = [device for device, (kind, _) in devices.items() if kind == MOCK]

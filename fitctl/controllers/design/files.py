@@ -78,7 +78,7 @@ def design_of(
         got = document.get(key)
         if not _same(got, expected):
             hint = "design it again for this rig: fitctl design ... --out FILE"
-            raise _refusal(path, key, f"this rig needs {_shown(expected)}", _shown(got), hint)
+            raise _refusal(path, key, f"{_shown(expected)} for this rig", _shown(got), hint)
     name = str(document.get("name"))
     if document.get("own") is True and name not in makers and is_name(name):
         return _as_given(document, name, path, rig_basis)
@@ -107,7 +107,7 @@ def _check_outputs(document: Mapping[str, Any], path: Path, writes: int) -> None
     expected, got = outputs_of(writes), document.get("outputs")
     if got != expected:
         hint = "design it again for this rig: fitctl design ... --out FILE"
-        raise _refusal(path, "outputs", f"this rig needs {_shown(expected)}", _shown(got), hint)
+        raise _refusal(path, "outputs", f"{_shown(expected)} for this rig", _shown(got), hint)
 
 
 def _as_given(document: Mapping[str, Any], name: str, path: Path, rig_basis: Basis) -> Design:

@@ -81,6 +81,20 @@ def test_info_as_json_has_the_rig_file_too(log, whole):
     assert (document["finished"], document["recording"], document["kept"]) == (True, False, False)
 
 
+def test_verify_checks_the_others_where_one_is_no_log(log, whole, tmp_path):
+    empty = tmp_path / "empty.mcap"
+    empty.touch()
+
+    status, text, err = log("verify", empty, whole)
+    assert status == 2
+    assert f"{whole}: whole" in text
+    assert f"{empty}: is not an MCAP log" in err
+
+    status, text, _ = log("verify", empty, whole, "--json")
+    assert status == 2
+    assert [each["whole"] for each in json.loads(text)] == [False, True]
+
+
 def test_verify_tells_by_its_status_whether_all_are_whole(log, whole, broken):
     status, text, _ = log("verify", whole)
     assert (status, text) == (

@@ -54,6 +54,37 @@ def test_what_could_not_end_well_is_not_begun(identify, monkeypatch, tmp_path, a
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("head", "is_refused"),
+    [
+        ("schema_version = 2\n", True),
+        (
+            "# Written by `fitctl identify delay` for rig a",
+            True,
+        ),  # measured, which a simulation is not
+        ("# Written by `fitctl identify delay --simulate` for rig a", False),
+    ],
+)
+def test_only_a_fragment_of_its_own_kind_is_replaced(
+    identify, monkeypatch, tmp_path, head, is_refused
+):
+    def begun(*_):
+        msg = "begun"
+        raise IdentifyError(msg)
+
+    monkeypatch.setattr(commands, "on_simulation", begun)
+    mine = tmp_path / "mine.toml"
+    mine.write_text(head)
+
+    status, err = identify("delay", "--simulate", "--out", mine)
+
+    assert mine.read_text() == head
+    assert status == (2 if is_refused else 1)
+    assert (
+        "exists already, and was not written by fitctl identify delay --simulate" in err
+    ) is is_refused
+
+
 def test_the_help_names_every_experiment(capsys):
     with pytest.raises(SystemExit):
         main(["identify", "--help"])

@@ -44,6 +44,30 @@ def fitctl(capsys, tmp_path, monkeypatch):
 # ---------------------------------------------------------------- by itself
 
 
+def test_in_a_folder_that_is_gone_it_says_what_to_do_next_too(fitctl, tmp_path, monkeypatch):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+
+    status, out, _ = fitctl()
+
+    assert status == 0
+    assert "fitctl demo" in out
+
+
+@pytest.mark.parametrize("file", ["a\x1b[31mb.toml", "my rig.toml", "☆.toml"])
+def test_a_file_whose_name_is_none_for_a_rig_asks_for_another_name(fitctl, tmp_path, file):
+    status, out, err = fitctl("init", "--mocks", "--no-doctor", file)
+
+    assert (status, out) == (2, "")
+    assert "expected letters, digits" in err
+    assert "give another with --name" in err
+    assert len(err.splitlines()) == 1
+    assert not list(tmp_path.iterdir())
+    assert fitctl("init", "--mocks", "--no-doctor", "--name", "mine", "my rig.toml")[0] == 0
+
+
 def test_by_itself_it_says_what_to_do_next(fitctl):
     status, out, _ = fitctl()
 
@@ -246,7 +270,7 @@ def test_a_testbed_with_photodiodes_and_hexapod_of_its_own(fitctl, tmp_path):
         ),
         (("--testbed", "--camera", "mock"), "--hexapod c887:socket://192.168.1.40:50000 or mock"),
         (("--testbed", "--mocks", "--photodiodes", "u3:1"), "must be like one of labjack_t7:"),
-        (("--mocks", "--name", "two words"), "name: "),
+        (("--mocks", "--name", "two words"), "name 'two words': expected letters"),
         (("no/such/folder/rig.toml", "--mocks"), "cannot be written"),
     ],
 )
