@@ -15,7 +15,6 @@ from fitctl.config import ConfigError, default_rig_path, load_rig
 from fitctl.logging.errors import LogError
 from fitctl.logging.records import RunInfo, Snapshot
 from fitctl.logging.writer import LogWriter
-from fitctl.messages.telemetry import LoopFailure
 from fitctl.tui.alarms import notes
 from fitctl.tui.app import ConsoleApp
 from fitctl.tui.commands import VIEWS
@@ -333,12 +332,18 @@ def with_states(messages, change):
 
 
 def test_a_moment_that_cannot_be_shown_is_told_and_the_next_one_is_shown(tmp_path):
-    failure = LoopFailure(time_s=float("nan"), what="acquire", text="no star")
     messages = FakeSupervisor().messages(100)
-    broken = with_states(messages[50:], lambda loop: replace(loop, last_failure=failure))
-    path = write_log(tmp_path / "log.mcap", [*messages[:50], *broken])
+
+    class Odd(LoggedRun):
+        def at(self, time_s):
+            if time_s > messages[50].time_s:
+                msg = "what nobody expects"
+                raise TypeError(msg)
+            return super().at(time_s)
+
+    path = write_log(tmp_path / "log.mcap", messages)
     made = queue.Queue()
-    player = Player(LoggedRun(path, loops_at_start), lambda _, what: made.put(what))
+    player = Player(Odd(path, loops_at_start), lambda _, what: made.put(what))
     try:
         player.seek(messages[-1].time_s)
         assert "this moment cannot be shown: " in made.get(timeout=10.0)
