@@ -467,11 +467,13 @@ def test_a_result_of_all_loops_is_the_simulations(kind):
 
 
 def test_a_course_that_the_hexapod_refuses_is_bad_input():
-    rig = rig_of_testbed("collector.motion.amplitude_mm=60.0", "collector.motion.kind=sine",
-                       "collector.motion.start_s=2.0", "collector.motion.frequency_hz=0.001")  # fmt: skip
+    rig = rig_of_testbed("collector.motion.amplitude_mm=30.0", "collector.motion.kind=sine",
+                       "collector.motion.start_s=2.0", "collector.motion.frequency_hz=0.001",
+                       "collector.hexapod.travel.x_mm=[-20.0,50.0]",
+                       "collector.hexapod.travel.y_mm=[-20.0,50.0]")  # fmt: skip
 
     assert Batch(rig).run(1, 4.0).ended == REFUSED_COURSE
-    with pytest.raises(ConfigError, match=r"collector\.motion: .* within -50 and 50"):
+    with pytest.raises(ConfigError, match=r"collector\.motion: .* within -20 and 50"):
         Batch(rig).result(1, 4.0)
 
 
