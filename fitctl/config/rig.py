@@ -37,6 +37,7 @@ AnyLoop = Annotated[
 
 
 RIG_NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,40}$"
+"""A pattern: rigs' names become parts of file names."""
 
 
 class Rig(Settings):

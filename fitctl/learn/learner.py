@@ -118,7 +118,7 @@ class Learner:
             self._new += 1
 
     def forget(self) -> None:
-        """What was added is of another light: begin again."""
+        """Begin again: the frames that were added are of another night, or of a star of another light."""
         self._added = self._new = 0
         self._due_after = self._first
 
@@ -140,7 +140,7 @@ class Learner:
     def report(self, present: Design, frames: Floats | None = None) -> LearnerReport:
         """Estimate and design, with `present` in force; a report without a result has the reason.
 
-        `frames` are those that :meth:`newest` gave; without them, it is asked now.
+        `frames` is the copy that the caller made with :meth:`newest`; by default this makes one.
         """
         self._begin_report()
         table = self.newest() if frames is None else frames

@@ -17,7 +17,7 @@ from fitctl.config import ConfigError, Rig
 from fitctl.controllers.centroid import sensor_noise_px
 from fitctl.controllers.design.choose import design_for
 from fitctl.learn.learner import Learner
-from fitctl.loop.learning import MOST_NOISE_RATIO
+from fitctl.loop.learning import is_other_light
 from fitctl.messages.client import Client
 from fitctl.messages.commands import LearnerReport
 from fitctl.messages.telemetry import LoopState, Telemetry
@@ -42,28 +42,22 @@ class LoopLearner:
         self._key = ""  # of the design in force
         loop = rig.stellar_loops[loop_name]
         self._rig_noise_px = sensor_noise_px(rig.camera, loop, loop.star_flux_dn)
-        self._noise_px = self._rig_noise_px
-        self._report: tuple[Future[LearnerReport], str] | None = (
-            None  # with the key at its beginning
-        )
+        self._noise_px = self._rig_noise_px  # of the last design that was not learnt
+        # With the key at its beginning.
+        self._report: tuple[Future[LearnerReport], str] | None = None
 
     def hear(self, telemetry: Telemetry, state: LoopState) -> None:
         """One message."""
         self._state = state
-        is_learnt = state.learning is not None and state.learning.design_json
-        if not (is_learnt or self._is_same_light(state.noise_px)):
-            self._learner.forget()
+        if state.learning is None or not state.learning.design_json:
+            before_px, self._noise_px = self._noise_px, state.noise_px or self._rig_noise_px
+            if is_other_light(before_px, self._noise_px):
+                self._learner.forget()
         self._key = f"{state.design} {state.controller_digest} {state.noise_px}"
         self._learner.watch(self._key, telemetry.time_s)
         for tick in telemetry.ticks:
             if tick.loop == self.loop_name:
                 self._learner.add(tick)
-
-    def _is_same_light(self, noise_px: float | None) -> bool:
-        """Whether a design is for about the same noise of the sensor as the last that was not learnt."""
-        before_px, self._noise_px = self._noise_px, noise_px or self._rig_noise_px
-        least_px, most_px = sorted([before_px, self._noise_px])
-        return most_px <= MOST_NOISE_RATIO * least_px
 
     def work(self, executor: ThreadPoolExecutor) -> LearnerReport | None:
         """Begin a report that is due, beside the messages; the one that is ready.

@@ -133,9 +133,8 @@ def read_records(path: Path, topics: Collection[str] | None = None) -> Iterator[
     with opened(path) as (stream, finished), up_to_the_tear(path, finished):
         kind = IndexedReader if finished else NonSeekingReader
         reader = kind(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
-        if isinstance(
-            reader, NonSeekingReader
-        ):  # an index is no smaller in the file than in memory
+        # An index is as large in the file as in memory, but chunks unpack to more.
+        if isinstance(reader, NonSeekingReader):
             reader._schemas, reader._channels = Described(path), Described(path)
         # Not ordered by log time: it is already, and sorting a cut file gives nothing at all.
         for _, channel, header, message in reader.iter_decoded_messages(

@@ -176,7 +176,7 @@ class Learning:
             for seen in recent:
                 self._comparison.observe(seen.error_px, seen.mirror_rad, seen.motor_rad)
         self._limit_px = max(report.measured_px, report.learnt_camera_px)
-        self._judge_from(-math.inf, report)
+        self._judge_from(-math.inf)
 
     def fell_back(self, reason: str, now_s: float) -> None:
         """The previous design is in force again."""
@@ -223,7 +223,7 @@ class Learning:
         self._last_s = now_s
         if is_gap or hindered:
             # The star is caught again first: that says nothing of the design.
-            self._judge_from(now_s + CALM_S, self.in_force)
+            self._judge_from(now_s + CALM_S)
         if is_gap:
             self._calm_since_s = None
             self._restart_comparison()
@@ -243,12 +243,12 @@ class Learning:
             error_px = self._comparison.error_px
         return self._why_back(error_px, now_s)
 
-    def _judge_from(self, time_s: float, in_force: LearnerReport | None) -> None:
+    def _judge_from(self, time_s: float) -> None:
         """Compare the design's residual with its limit from a time on, as if it had left what it promised."""
         self._judged_from_s = time_s
-        if in_force is not None:
+        if self.in_force is not None:
             for means in (*self._means_px2, *self._before_px2):
-                means[:] = [in_force.learnt_camera_px**2] * 2
+                means[:] = [self.in_force.learnt_camera_px**2] * 2
 
     def _restart_comparison(self) -> None:
         if self._comparison is not None:
@@ -317,6 +317,11 @@ class Learning:
 def has_moved(target_px: AzEl, before_px: AzEl, period_s: float) -> bool:
     """Whether the target is not where it was a frame before; so it is where that is not known (NaN)."""
     return not math.dist(target_px, before_px) <= STILL_PX_PER_S * period_s
+
+
+def is_other_light(noise_px: float, other_px: float) -> bool:
+    """Whether the noise of two stars' places differs so much that each needs a design of its own."""
+    return max(noise_px, other_px) > MOST_NOISE_RATIO * min(noise_px, other_px)
 
 
 def _gained(report: LearnerReport) -> float:

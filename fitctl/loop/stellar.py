@@ -23,7 +23,7 @@ from fitctl.drivers.interface import DeviceError, Frame, LoopDevices
 from fitctl.logging.records import ControllerChange, OutputsFound, StarPlace, Tick
 from fitctl.loop.experiments import Experiments
 from fitctl.loop.following import Following
-from fitctl.loop.learning import MOST_NOISE_RATIO, Learning
+from fitctl.loop.learning import Learning, is_other_light
 from fitctl.loop.link import BacklashFeedforward, Link
 from fitctl.loop.loop import Loop
 from fitctl.loop.metrology import MetrologyLoop
@@ -400,10 +400,10 @@ class StellarLoop(Loop):
     def configure_search(self, asked: Acquire) -> None:
         """What the next search is to find, and how, as a command asks that was not refused."""
         flux_dn = asked.star_flux_dn or self.settings.star_flux_dn
-        noises_px = [
-            self.star_finder.noise_px(each) for each in (flux_dn, self.quantities.star_flux_dn)
-        ]
-        if self.learning.before and max(noises_px) > MOST_NOISE_RATIO * min(noises_px):
+        noise_px, before_px = map(
+            self.star_finder.noise_px, (flux_dn, self.quantities.star_flux_dn)
+        )
+        if self.learning.before and is_other_light(noise_px, before_px):
             # Of the design before, another can be made for the new star's light.
             why = f"the next star has {flux_dn:g} DN, and the learnt design is for another light"
             self.use(self.learning.before, why, by_itself=True)

@@ -372,9 +372,7 @@ def ask_bench(port: int, question: _AnyQuestion, answer: type[_Answer]) -> _Answ
             try:
                 return msgspec.msgpack.decode(socket.recv(), type=answer)
             except UNDECODABLE:
-                msg = (
-                    f"what answers at 127.0.0.1:{port} is no bench of a mock testbed of this fitctl"
-                )
+                msg = f"another program answers at 127.0.0.1:{port}; expected the mocks of this fitctl"
                 raise ConnectionError(msg) from None
     finally:
         context.term()

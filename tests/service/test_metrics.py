@@ -83,7 +83,7 @@ def of(name, **labels):
     return name, frozenset(labels.items())
 
 
-def test_nothing_is_told_of_an_instrument_that_was_never_heard(served):
+def test_nothing_is_shown_of_an_instrument_that_was_never_heard(served):
     assert served.scrape() == {of("fitctl_up"): 0.0}
 
 
@@ -164,7 +164,7 @@ def test_a_message_that_cannot_be_read_ends_nothing(served):
     assert served.scrape()[of("fitctl_up")] == 1
 
 
-def test_a_taken_port_is_told_in_one_line():
+def test_a_taken_port_is_shown_in_one_line():
     with socket.socket() as taken:
         taken.bind((HOST, 0))
         taken.listen()
@@ -325,11 +325,11 @@ def test_what_was_measured_before_a_stop_or_a_restart_is_not_told_as_newest(pid,
     assert told >= SUMS
 
 
-@pytest.mark.parametrize(("later_s", "is_told"), [(30.0, True), (70.0, False)])
-def test_stack_voltages_of_an_amplifier_that_is_not_read_any_more_are_not_told(later_s, is_told):
+@pytest.mark.parametrize(("later_s", "is_shown"), [(30.0, True), (70.0, False)])
+def test_stack_voltages_of_an_amplifier_that_is_not_read_any_more_are_left_out(later_s, is_shown):
     collector, message = InstrumentCollector(), FakeSupervisor().message()
     (reading, *_) = message.piezo
     later = msgspec.structs.replace(message, time_s=reading.time_s + later_s)
     collector.accept(later, time.monotonic())
 
-    assert ("fitctl_stack_volts" in gauges_and_counters(collector)) is is_told
+    assert ("fitctl_stack_volts" in gauges_and_counters(collector)) is is_shown

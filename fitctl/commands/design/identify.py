@@ -116,7 +116,7 @@ def identify(
     source = Source(log, simulated, mock, seed)
     by = f"fitctl identify {what}{' --simulate' * simulated}{' --mocks' * mock}"
     fragment_path = out or Path(f"{settings.name}-{loop}-{what}.toml")
-    plot_path = _plot_path(fragment_path, plot, what, by)
+    plot_path = _plot_path(fragment_path, plot, by)
     try:
         with ended_by_signals(interrupt), progress_line(f"identify {what}") as progress:
             finding = _finding(
@@ -139,10 +139,10 @@ def identify(
     say(f"written: {fragment_path} (name it in the rig file's include list), {plot_path}")
 
 
-def _plot_path(fragment: Path, wanted: Path | None, what: str, by: str) -> Path:
+def _plot_path(fragment: Path, wanted: Path | None, by: str) -> Path:
     """Where the plot goes; refuses, before minutes of an experiment, what could not be written after them."""
     _require_writable(fragment)
-    _require_own(fragment, what, by)
+    _require_own(fragment, by)
     plot = wanted or fragment.with_suffix(".png")
     if plot.suffix not in _PLOT_SUFFIXES:
         msg = f"identify: {plot}: plots are {' or '.join(_PLOT_SUFFIXES)}; name another with --plot"
@@ -160,14 +160,13 @@ def _require_writable(path: Path) -> None:
         raise ConfigError(msg)
 
 
-def _require_own(path: Path, what: str, by: str) -> None:
-    """Refuse to replace what is no fragment of this command, and what is measured with what is simulated."""
+def _require_own(path: Path, by: str) -> None:
+    """Refuse a file that another command wrote; a simulated run does not replace a measured fragment either."""
     if not path.exists():
         return
     with path.open("rb") as file:
         head = file.readline(200).decode(errors="replace")
-    measured = f"fitctl identify {what}"
-    if head.startswith(f"# Written by `{by}`") or (by == measured and f"`{measured}" in head):
+    if head.startswith(f"# Written by `{by}"):  # a measured run also replaces `... --simulate`
         return
     msg = (
         f"identify: {path}: exists already, and was not written by {by}; name another file with --out, or "

@@ -154,7 +154,7 @@ def _change(
         msg = f"fault: {now.error}"
         raise ConfigError(msg)
     if as_json:
-        say(to_json(msgspec.to_builtins(now.active)))
+        say(to_json(now.active))
         return
     for line in map(_line, now.active):
         say(line)

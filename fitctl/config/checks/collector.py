@@ -74,8 +74,8 @@ def _motion(collector: Collector) -> Iterator[Conflict]:
             ),
         )
     for kinds, key in ((("drift", "random"), "range_mm"), (("sine",), "amplitude_mm")):
-        way_mm, farthest_mm = getattr(motion, key), _farthest_mm(collector)
-        if motion.kind in kinds and way_mm > farthest_mm:
+        way_mm = getattr(motion, key)
+        if motion.kind in kinds and way_mm > (farthest_mm := _farthest_mm(collector)):
             yield Conflict(
                 "the hexapod's travel is shorter",
                 (at_most(f"motion.{key}", way_mm, farthest_mm),),

@@ -126,7 +126,10 @@ def test_another_program_at_the_bench_s_port_is_one_line(capsys, reply):
         answering.join(timeout=10)
 
     assert end.value.code == 2
-    assert f"what answers at 127.0.0.1:{port} is no bench" in capsys.readouterr().err
+    assert (
+        f"another program answers at 127.0.0.1:{port}; expected the mocks"
+        in capsys.readouterr().err
+    )
 
 
 @pytest.mark.parametrize(

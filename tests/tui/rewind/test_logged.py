@@ -337,7 +337,7 @@ def test_a_moment_that_cannot_be_shown_is_told_and_the_next_one_is_shown(tmp_pat
     class Odd(LoggedRun):
         def at(self, time_s):
             if time_s > messages[50].time_s:
-                msg = "what nobody expects"
+                msg = "a record of an unknown kind"
                 raise TypeError(msg)
             return super().at(time_s)
 
