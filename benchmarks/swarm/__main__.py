@@ -19,14 +19,15 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from itertools import count, repeat
 from random import Random
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 
 from benchmarks.swarm.drivers import NIGHTS
+from benchmarks.swarm.invariants import NO_EXCEPTION
 from benchmarks.swarm.past import DEFECTS, put_back
 from benchmarks.swarm.plan import Plan, plan_of
-from benchmarks.swarm.run import NO_EXCEPTION, Result, failed_run, run_plan
+from benchmarks.swarm.run import Result, failed_run, run_plan
 from benchmarks.swarm.shrink import shrunk, shrunk_from
 from fitctl.logging.records import AnyRecord, Event
 from fitctl.processes import ended_by_signals
@@ -115,7 +116,7 @@ class Totals:
         """Draw the progress bar."""
         _progress(self.simulated_s / 3600, hours, len(self.found), self._started_s)
 
-    def as_object(self, seed: int) -> dict[str, object]:
+    def as_object(self, seed: int) -> dict[str, Any]:
         """The object that the command prints."""
         simulated_s, cpu_s, pairs = self.simulated_s, self._cpu_s, self._pairs
         return {
@@ -132,7 +133,7 @@ class Totals:
         }
 
 
-def swarm(seed: int, hours: float, jobs: int) -> dict[str, object]:
+def swarm(seed: int, hours: float, jobs: int) -> dict[str, Any]:
     """Run until so many hours are simulated, a thing was violated in ten runs, or somebody presses Ctrl-C.
 
     Runs that have begun then are finished and counted: one that is being shrunk takes longer than the others,
@@ -178,7 +179,7 @@ def find(defect: str, seed: int, hours: float, jobs: int) -> dict[str, object]:
             ):
                 runs += 1
                 simulated_s += result.lasted_s
-                if result.violations:
+                if result.violations and _by_the_defect(plan.seed, result):
                     return {
                         "hours": round(simulated_s / 3600, 3),
                         "runs": runs,
@@ -187,6 +188,12 @@ def find(defect: str, seed: int, hours: float, jobs: int) -> dict[str, object]:
                         "detail": result.violations[0].detail,
                     }
     return {"hours": None, "not_in_hours": round(simulated_s / 3600, 3), "runs": runs}
+
+
+def _by_the_defect(seed: int, result: Result) -> bool:
+    """Whether the run without the defect does not violate the same."""
+    clean = run_seed(seed).result.violations
+    return result.violations[0].invariant not in {one.invariant for one in clean}
 
 
 def finding(run: Run) -> dict[str, object]:
@@ -290,6 +297,8 @@ def main() -> int:
     print(f"seed {seed}", file=sys.stderr)
     found = swarm(seed, options.hours, options.jobs)
     print(json.dumps(found, indent=1))
+    for violation in found["violations"]:  # last: of a long log, often only the end is kept
+        print(violation.get("replay"), violation["violated"][0], file=sys.stderr)
     return 1 if found["violations"] else 0
 
 

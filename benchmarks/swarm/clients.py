@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from random import Random
+from typing import Any
 
 from benchmarks.swarm.invariants import Invariants
 from benchmarks.swarm.service import SwarmService
@@ -19,18 +20,38 @@ from fitctl.service.admission import Sender
 from fitctl.supervisor.supervisor import Supervisor
 from fitctl.tui.state import ConsoleState
 
-STEPS: dict[str, Callable[[], steps.Step]] = {
-    "standby": steps.Standby,
-    "acquire": steps.Acquire,
-    "hold": lambda: steps.Hold(duration_s=5.0, settle_s=1.0, attempts=2),
-    "wait": lambda: steps.Wait(duration_s=3.0),
-    "dither": lambda: steps.Dither(dwell_s=3.0, steady_after_s=1.0),
-    "offset": lambda: steps.Offset(
-        offset_az_px=0.5, offset_el_px=-0.5, dwell_s=3.0, steady_after_s=1.0
+_VISIT: dict[str, Any] = {"dwell_s": 8.0, "steady_after_s": 5.0}
+_STARS = [
+    steps.Star(name="expected", az_sky_arcsec=0.0, el_sky_arcsec=0.0, duration_s=2.0),
+    steps.Star(name="elsewhere", az_sky_arcsec=60.0, el_sky_arcsec=-40.0, duration_s=2.0),
+]
+STEPS: dict[str, Callable[[str], steps.Step]] = {
+    "standby": lambda loop: steps.Standby(loop=loop),
+    "acquire": lambda loop: steps.Acquire(loop=loop),
+    "hold": lambda loop: steps.Hold(loop=loop, duration_s=5.0, settle_s=1.0, attempts=2),
+    "stars": lambda loop: steps.Stars(loop=loop, stars=_STARS, settle_s=1.0),
+    "wait": lambda _: steps.Wait(duration_s=3.0),
+    "dither": lambda loop: steps.Dither(loop=loop, **_VISIT),
+    "raster": lambda loop: steps.Raster(loop=loop, columns=2, rows=2, **_VISIT),
+    "offset": lambda loop: steps.Offset(loop=loop, offset_az_px=0.5, offset_el_px=-0.5, **_VISIT),
+    "controller": lambda loop: steps.Controller(loop=loop, name="minimum-variance"),
+    "experiment": lambda loop: steps.Experiment(loop=loop, what="delay"),
+    "chirp": lambda loop: steps.Chirp(loop=loop, channel="fsm_az", duration_s=4.0),
+    "plate_scale": lambda loop: steps.PlateScale(loop=loop, duration_s=8.0),
+    "dark": lambda _: steps.Dark(frames=20),
+    "reference": lambda _: steps.Collector(action="reference"),
+    "collector": lambda _: steps.Collector(action="start"),
+    "collector_scan": lambda loop: steps.CollectorScan(loop=loop, amplitude_mm=1.0, cycles=1),
+    "beam_scan": lambda _: steps.BeamScan(
+        loop="metrology", span_sky_arcsec=100.0, slow_sky_arcsec_s=100.0, cycles=1
     ),
-    "off": steps.Off,
+    "beam_standby": lambda _: steps.Standby(loop="metrology"),
+    "ambient": lambda _: steps.Ambient(loop="metrology", duration_s=2.0),
+    "visibility": lambda loop: steps.Visibility(loop=loop, duration_s=3.0, settle_s=1.0),
+    "overlap": lambda loop: steps.Overlap(loop=loop, **_VISIT),
+    "off": lambda loop: steps.Off(loop=loop),
 }
-"""The steps of which operators make their sequences."""
+"""The steps of which operators make their sequences, for a loop."""
 _REPLY_S = 5.0
 
 
@@ -161,10 +182,10 @@ class RunningSequence:
     ended : bool
     """
 
-    def __init__(self, link: Link, rig: Rig, words: Sequence[str]) -> None:
+    def __init__(self, link: Link, rig: Rig, loop: str, words: Sequence[str]) -> None:
         self.ended = False
         self._link = link
-        self._steps = [STEPS[word]() for word in words]
+        self._steps = [STEPS[word](loop) for word in words]
         self._contact = Contact(link, rig, "swarm", len(words))  # type: ignore[arg-type]
 
     def run(self) -> None:

@@ -21,12 +21,14 @@ from fitctl.drivers.interface import AzEl, Pose
 from fitctl.logging.records import (
     AnyRecord,
     ControllerChange,
+    DeviceFailure,
     DevicesOpened,
     Event,
     ModeChange,
     PiezoReading,
     Tick,
 )
+from fitctl.loop.loop import Loop
 from fitctl.messages.commands import (
     AnyCommand,
     Experiment,
@@ -35,6 +37,7 @@ from fitctl.messages.commands import (
     MoveCollector,
     Recover,
     Reply,
+    SetBiasOffset,
     Standby,
     Stop,
 )
@@ -43,9 +46,11 @@ from fitctl.model.drives import experiment_s
 from fitctl.model.optics import motor_sky_rad_per_rad
 from fitctl.model.plant import Plant
 from fitctl.service.admission import Sender
+from fitctl.stages.journal import NO_MISTAKE
 from fitctl.supervisor.supervisor import Supervisor
 
 Floats = NDArray[np.float64]
+NO_EXCEPTION = "no exception escapes"
 _SLACK = 1.0 + 1e-6
 POWER_S = 1.0  # a loop may have power without need, or need without power, no longer than this
 _AT_REST = frozenset({Mode.OFF, Mode.SAFE})
@@ -68,8 +73,10 @@ _ANOTHERS_PX = 6.0  # from its own star, no window of a loop shows its own
 _MOST_WRONG_S = 10.0
 # As `made_safe` in the fault catalogue, tests/faults/devices.py.
 _SAFE_S, _SAFE_BY_PIEZO_S = 3.0, 8.0
+_MIRROR_RESTS_S = 1.0  # beyond the time that a mirror takes through its whole range
 _STUCK_S = 1.0  # for so long after motors were stuck, a servo may still be behind its reference
 _RESTS_S = 1.0  # beyond the time after which a drive without its master stops by itself
+_SURELY = 1.2  # times the following error limit: a servo that is behind so far must notice
 _HARDLY = 0.02  # of the velocity limit: slower, a servo corrects what its encoder counts
 _MOVED_S = 1.0  # beyond the time that a siderostat takes from one end of its travel to the other
 _COLLECTOR_RESTS_S = 3.0
@@ -97,6 +104,10 @@ class _Lasting:
             return 0.0
         since_s = self._since_s[name] = max(from_s, self._since_s.get(name, now_s))
         return now_s - since_s
+
+    def is_so(self, name: str) -> bool:
+        """It was so when last judged."""
+        return name in self._since_s
 
     def leave_out(self, left_out_s: float) -> None:
         """Do not count a time."""
@@ -162,11 +173,12 @@ class Invariants:
         self._oldest_s = camera.frame_delay_s + _MOST_PERIODS * camera.period_s
         self._most_step_s = _MOST_STEP_S * (1 + len(self._stellar_loops))
         self._slowly: dict[str, bool] = {}
+        self._mirror_moved_s: dict[str, float] = {}  # by loop: when something moved it that may
         self._busy_since_s = math.inf
         self._stepped_s = 0.0
         self._powerless, self._unneeded = _Lasting(), _Lasting()
         self._silent, self._turning, self._stopped_for = _Lasting(), _Lasting(), _Lasting()
-        self._experimenting = _Lasting()
+        self._experimenting, self._sticking = _Lasting(), _Lasting()
         self._lasting = (
             self._powerless,
             self._unneeded,
@@ -174,6 +186,7 @@ class Invariants:
             self._turning,
             self._stopped_for,
             self._experimenting,
+            self._sticking,
         )
         self._ticked_s = self._stall_ended_s = 0.0
         self._jogged_s: dict[str, float] = {}
@@ -293,6 +306,9 @@ class Invariants:
         if isinstance(command, Stop):
             for name in self._named(command):
                 self._stopped_s[name] = self._clock.now_s()
+        elif isinstance(command, SetBiasOffset):
+            for name in self._named(command):
+                self.mirror_moved(name)
         elif isinstance(command, Jog):
             self._jogged_s |= dict.fromkeys(self._named(command), self._clock.now_s())
 
@@ -307,6 +323,8 @@ class Invariants:
         for name in self._named(command):
             if isinstance(command, Stop):
                 self._stop_answered_s[name] = now_s
+            elif isinstance(command, SetBiasOffset):
+                self.mirror_moved(name)
             elif isinstance(command, Jog):
                 self._jogged_s[name] = now_s
             elif isinstance(command, Standby | Recover):
@@ -332,10 +350,15 @@ class Invariants:
                     self._acted_on(record)
                     self._follows(record)
             case ModeChange():
+                self._without_mistake(record.reason)
                 self._mode_changed(record)
             case Event():
+                self._without_mistake(record.message)
                 self._reported(record)
+            case DeviceFailure():
+                self._without_mistake(record.error)
             case DevicesOpened():
+                self._without_mistake(record.error)
                 self._texts.clear()
                 if not record.error:
                     self._opened_well(record)
@@ -344,6 +367,11 @@ class Invariants:
                 self._controller_changed(record)
             case PiezoReading():
                 self._piezo_read_s[record.loop] = record.time_s
+
+    def _without_mistake(self, text: str) -> None:
+        """A mistake in fitctl that a thread takes for a fault of its device has its own text."""
+        if NO_MISTAKE in text:
+            self.violated(NO_EXCEPTION, text)
 
     def _controller_changed(self, change: ControllerChange) -> None:
         """Another design is in force; one with a reason was not chosen by an operator."""
@@ -413,7 +441,7 @@ class Invariants:
         """
         line = self._lines["camera"]
         return (
-            not line.faults
+            not line.is_bad
             and "drops" not in line.wrong
             and self._clock.now_s() - line.healed_s > _WELL_S
         )
@@ -504,7 +532,7 @@ class Invariants:
         moves_s = max(since_s, self._jogged_s.get(name, 0.0), line.healed_s, self._stall_ended_s)
         rested_s = self._clock.now_s() - moves_s
         # Motors that do not move are commanded on, until the servo notices.
-        if not line.faults and not line.wrong and rested_s > self._moved_s[name]:
+        if not line.is_bad and not line.wrong and rested_s > self._moved_s[name]:
             self.violated(
                 "a siderostat that nobody moves stands still in STANDBY",
                 f"{name}: {velocity_rad_s} rad/s {rested_s:.3f} s after it was moved",
@@ -536,7 +564,8 @@ class Invariants:
         if self._supervisor is None:
             return
         # The first write in a mode was decided in the one before.
-        slowly = self._supervisor.loops[name].mode in _SLOWLY
+        loop = self._supervisor.loops[name]
+        slowly = loop.mode in _SLOWLY
         was_slow, self._slowly[name] = self._slowly.get(name, False), slowly
         if not (slowly and was_slow):
             return
@@ -547,6 +576,41 @@ class Invariants:
                 "the mirror rests no faster than its slew",
                 f"{name}: {step_v:.3f} V in one write, at most {most_v:.3f} V",
             )
+        if step_v > fsm.dac.step_v:
+            self._mirror_rests(name, loop, step_v)
+
+    def _mirror_rests(self, name: str, loop: Loop, step_v: float) -> None:
+        """In OFF and SAFE a mirror moves to its bias, and again after its D/A has moved it or was silent."""
+        fsm, line = self._stellar_loops[name].fsm, self._lines[f"{name} D/A"]
+        moves_s = max(
+            loop.mode_since_s,
+            line.healed_s,
+            self._stall_ended_s,
+            self._mirror_moved_s.get(name, 0.0),
+        )
+        rested_s = self._clock.now_s() - moves_s
+        if (
+            loop.mode in _AT_REST
+            and not line.is_bad
+            and not line.wrong
+            and rested_s > fsm.dac.full_scale_v / fsm.slew_v_per_s + _MIRROR_RESTS_S
+        ):
+            self.violated(
+                "a mirror rests in OFF and SAFE",
+                f"{name}: {step_v:.3f} V in one write after {rested_s:.2f} s in {loop.mode.name}",
+            )
+
+    def mirror_moved(self, name: str) -> None:
+        """A loop's D/A has gone to its safe voltages by itself, or somebody commands another bias."""
+        self._mirror_moved_s[name] = self._clock.now_s()
+
+    def closed(self, reached: set[str]) -> None:
+        """A supervisor has ended in good order: no amplifiers keep power that it had reached until then."""
+        for name, amplifiers in self._amplifiers.items():
+            line = amplifiers.line
+            was_well = not line.is_bad and self._clock.now_s() - line.healed_s > _WELL_S
+            if amplifiers.powered and name in reached and was_well:
+                self.violated("amplifiers have no power when nobody controls them", name)
 
     # ------------------------------------------------------------ once a tick
 
@@ -571,7 +635,9 @@ class Invariants:
                 self.violated("an open piezo amplifier is read", f"{name}: not for a long time")
         if jobs.busy:
             self._silent.leave_out(since_tick_s)
+            self._sticking.leave_out(since_tick_s)
         for name, loop in supervisor.loops.items():
+            self._stuck(name, loop, now_s)
             self._power(name, loop.mode, busy=jobs.busy, now_s=now_s)
             self._safe_in_time(name, loop.mode, now_s)
             self._turns(name, loop.mode, now_s)
@@ -582,8 +648,9 @@ class Invariants:
         """A loop with a device that has been silent, or has reported a fault, for long is in SAFE or OFF."""
         for device, most_s in self._needed[name]:
             line = self._lines[device]
-            # A slow line has fewer answers that report a fault.
-            fault = "" if "slow" in line.faults else self._fault_of(name, device)
+            # A slow line, or one that fails at times, has fewer answers that report a fault.
+            seldom = line.at_times or "slow" in line.faults
+            fault = "" if seldom else self._fault_of(name, device)
             states = {
                 "silent": (line.is_silent, line.answered_s),
                 "failing": (fault, line.healed_s),
@@ -596,11 +663,40 @@ class Invariants:
                     from_s=from_s,
                 )
                 if lasted_s > most_s:
-                    how = ", ".join([*line.faults, *line.wrong, *filter(None, [fault])])
+                    how = ", ".join(
+                        [*line.faults, *line.at_times, *line.wrong, *filter(None, [fault])]
+                    )
                     self.violated(
                         "a loop without one of its devices is SAFE in time",
                         f"{name}: in {mode.name} after {device} was {state} for {lasted_s:.2f} s ({how})",
                     )
+
+    def _stuck(self, name: str, loop: Loop, now_s: float) -> None:
+        """A loop whose motors do not move, far from where they are sent, is SAFE in time."""
+        line, servo = self._lines[f"{name} siderostat"], loop.servo
+        if "stuck" not in line.wrong and not self._sticking.is_so(name):
+            return
+        wanted_rad, away_rad = servo._wanted_rad, 0.0
+        if wanted_rad is not None:
+            away_rad = max(
+                abs(wanted - at) for wanted, at in zip(wanted_rad, servo.position_rad, strict=True)
+            )
+        siderostat = self._rig.loops[name].siderostat
+        stuck_s = self._sticking.lasted_s(
+            name,
+            is_so="stuck" in line.wrong
+            and loop.mode not in _AT_REST
+            and not line.is_bad
+            and line.connected
+            and away_rad > _SURELY * siderostat.servo.following_error_limit_rad,
+            now_s=now_s,
+            from_s=line.healed_s,
+        )
+        if stuck_s > _SAFE_S + away_rad / siderostat.velocity_limit_rad_s:
+            self.violated(
+                "a loop whose motors are stuck is SAFE in time",
+                f"{name}: in {loop.mode.name}, {away_rad:.2f} rad from where it is sent for {stuck_s:.2f} s",
+            )
 
     def _experiments(self, name: str, mode: Mode, now_s: float) -> None:
         """An experiment ends after its last motion."""
@@ -622,7 +718,7 @@ class Invariants:
         line = amplifiers.line
         turns = mode in _AT_REST and amplifiers.velocity_rad_s != (0.0, 0.0)
         if turns and amplifiers.watches_nobody:
-            turns = name in self._opened and line.connected and not line.faults
+            turns = name in self._opened and line.connected and not line.is_bad
         turned_s = self._turning.lasted_s(name, is_so=turns, now_s=now_s)
         if turned_s > amplifiers.master_timeout_s + _RESTS_S:
             self.violated(
@@ -638,7 +734,7 @@ class Invariants:
         line = hexapod.line
         stopped_s = self._stopped_for.lasted_s(
             "",
-            is_so=self._collector_is_stopped and line.connected and not line.faults,
+            is_so=self._collector_is_stopped and line.connected and not line.is_bad,
             now_s=now_s,
             from_s=line.healed_s,
         )
@@ -660,7 +756,7 @@ class Invariants:
         ):
             self._unneeded.lasted_s(name, is_so=False, now_s=now_s)
             return
-        reachable = amplifiers.line.connected and not amplifiers.line.faults
+        reachable = amplifiers.line.connected and not amplifiers.line.is_bad
         rests = mode in _AT_REST
         powerless_s = self._powerless.lasted_s(
             name, is_so=not (rests or busy or amplifiers.powered), now_s=now_s

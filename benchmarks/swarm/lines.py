@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from random import Random
 from typing import TypeVar
 
@@ -41,6 +42,8 @@ its servos are off.
 """
 SILENCE = frozenset(FAULTS) - {"slow"}
 """Faults during which no answer arrives that makes sense."""
+OF_SOME_CALLS = tuple(fault for fault in FAULTS if fault != "unplugged")
+"""Faults that may meet only some of the calls."""
 
 
 class Bus:
@@ -82,6 +85,8 @@ class Line:
     ----------
     faults : dict of str to float
         The faults in force, from `FAULTS`. The value of "slow" is the factor.
+    at_times : dict of str to (float, float)
+        Those of `OF_SOME_CALLS` that meet only a fraction of the calls, and the value as in `faults`.
     wrong : dict of str to float
         The faults in force, from `WRONG`. The value of "stuck" of a piezo amplifier is the stack.
     wrong_until_s : dict of str to float
@@ -108,6 +113,7 @@ class Line:
         self.device = device
         self.endpoint = endpoint
         self.faults: dict[str, float] = {}
+        self.at_times: dict[str, tuple[float, float]] = {}
         self.wrong: dict[str, float] = {}
         self.wrong_until_s: dict[str, float] = {}
         self.healed_s = self.answered_s = -math.inf
@@ -117,12 +123,31 @@ class Line:
         self._time = time
         self._random = random
         self._usual_s = usual_s
+        self._until_s: dict[str, float] = {}
+
+    def begin(self, fault: str, lasts_s: float, size: float = 0.0, part: float = 1.0) -> None:
+        """Let a fault be in force for a time; one of the same kind that lasts longer is not cut short."""
+        if fault not in FAULTS:
+            self.wrong[fault] = size
+        elif part < 1.0:
+            self.at_times[fault] = part, size
+        else:
+            self.faults[fault] = size
+        until_s = self._time.now_s() + lasts_s
+        self._until_s[fault] = max(until_s, self._until_s.get(fault, 0.0))
+        self._time.call_at(until_s, partial(self._end, fault, until_s))
+
+    def _end(self, fault: str, until_s: float) -> None:
+        if self._until_s.get(fault) == until_s:
+            self.heal(fault)
 
     def heal(self, *faults: str) -> None:
         """End these faults, or all of them if none is named."""
         self.healed_s = self._time.now_s()
-        for fault in faults or [*self.faults, *self.wrong]:
+        for fault in faults or [*self.faults, *self.at_times, *self.wrong]:
+            self._until_s.pop(fault, None)
             self.faults.pop(fault, None)
+            self.at_times.pop(fault, None)
             if self.wrong.pop(fault, None) is not None:
                 self.wrong_until_s[fault] = self.healed_s
         if not self.faults.keys() & SILENCE:
@@ -132,6 +157,22 @@ class Line:
         """A fault from `WRONG` is in force, or was until recently."""
         until_s = self.wrong_until_s.get(fault, -math.inf)
         return fault in self.wrong or self._time.now_s() - until_s < within_s
+
+    @property
+    def is_bad(self) -> bool:
+        """Some calls, or all of them, may fail or take long."""
+        return bool(self.faults or self.at_times)
+
+    def of_this_call(self) -> dict[str, float]:
+        """The faults of one call: those in force, and, drawn, those that meet only some calls."""
+        if not self.at_times:
+            return self.faults
+        drawn = {
+            fault: size
+            for fault, (part, size) in self.at_times.items()
+            if self._random.random() < part
+        }
+        return self.faults | drawn
 
     @property
     def is_silent(self) -> bool:
@@ -154,10 +195,10 @@ class Line:
         """Disconnect."""
         self.connected = False
 
-    def delay_s(self) -> float:
+    def delay_s(self, faults: dict[str, float]) -> float:
         """Draw the duration of the next exchange."""
         delay_s = self._usual_s * (0.7 + 0.6 * self._random.random())
-        return delay_s * self.faults["slow"] if "slow" in self.faults else delay_s
+        return delay_s * faults["slow"] if "slow" in faults else delay_s
 
     def ask(self, act: Callable[[], Result]) -> Result:
         """Send a request that the device carries out with ``act``, and return its answer.
@@ -170,9 +211,10 @@ class Line:
             raise DeviceUnreachable(
                 self.device, self.endpoint, "an open connection", "none", "open it again"
             )
-        if self.faults:
-            return self._ask_badly(act)
-        half_s = self.delay_s() / 2
+        faults = self.of_this_call()
+        if faults:
+            return self._ask_badly(act, faults)
+        half_s = self.delay_s(faults) / 2
         self._sleep(half_s)
         result = act()
         self._sleep(half_s)
@@ -180,26 +222,26 @@ class Line:
             raise self._unreachable("a broken connection")
         return result
 
-    def _ask_badly(self, act: Callable[[], Result]) -> Result:
+    def _ask_badly(self, act: Callable[[], Result], faults: dict[str, float]) -> Result:
         began_s = self._time.now_s()
-        if "unplugged" in self.faults:
+        if "unplugged" in faults:
             self.connected = False
             self._sleep(self._usual_s)
             raise self._unreachable("a broken connection")
-        delay_s = self.delay_s()
+        delay_s = self.delay_s(faults)
         self._sleep(min(delay_s / 2, self.timeout_s))
-        if "deaf" in self.faults or delay_s / 2 > self.timeout_s:
+        if "deaf" in faults or delay_s / 2 > self.timeout_s:
             self._sleep_until(began_s + self.timeout_s)
             raise self.timeout()
-        if "refuses" in self.faults:
+        if "refuses" in faults:
             self._sleep(min(delay_s / 2, self.timeout_s))
             raise DeviceRefused(self.device, self.endpoint, "to obey", "a refusal", "ask it why")
         result = act()
-        if "mute" in self.faults or delay_s > self.timeout_s:
+        if "mute" in faults or delay_s > self.timeout_s:
             self._sleep_until(began_s + self.timeout_s)
             raise self.timeout()
         self._sleep(delay_s / 2)
-        if "garbled" in self.faults:
+        if "garbled" in faults:
             raise self.garbled()
         if not self.connected:
             raise self._unreachable("a broken connection")

@@ -15,7 +15,7 @@ from benchmarks.swarm.commands import (
     drawn_target,
     far_search,
 )
-from benchmarks.swarm.lines import FAULTS, WRONG, drawn_slowness
+from benchmarks.swarm.lines import FAULTS, OF_SOME_CALLS, WRONG, drawn_slowness
 from benchmarks.swarm.rigs import FAST, RIGS, devices_of, drawn_settings, learning, stars_of
 from fitctl.messages.commands import (
     AnyCommand,
@@ -34,7 +34,28 @@ _OF_ONE_LOOP = 0.3  # fraction of commands that name a loop
 _WITHOUT_FAULTS = 0.15  # fraction of runs without device faults
 _CONSOLE_SLOW = 0.2  # fraction of runs whose console misses messages
 _REMOTE = 0.1  # fraction of runs with remote consoles: decoding takes a fifth of their time
-_STEPS = ("standby", "acquire", "acquire", "hold", "wait", "dither", "offset", "off")
+# Of sequences. Each of them begins at a star that is held, or is refused.
+_STEPS = (
+    "standby",
+    "acquire",
+    "hold",
+    "stars",
+    "wait",
+    "dither",
+    "raster",
+    "offset",
+    "controller",
+    "off",
+)
+_CALIBRATING = ("experiment", "chirp", "plate_scale", "standby dark")
+_OF_TESTBED = (
+    "reference collector",
+    "reference collector_scan",
+    "beam_scan",
+    "beam_standby ambient",
+    "visibility",
+    "overlap",
+)
 # Fraction of commands that are repeated, drawn for each run, and the mean delay: a key held down.
 _REPEATED, _REPEATED_S = (0.0, 0.1, 0.6), 0.02
 _PLACES, _FEW_PLACES = 3, 0.5  # fraction of runs whose targets are only so many places
@@ -42,6 +63,7 @@ _SLOW_SLEW = 0.4  # fraction of interrupted slews on a slow line
 _SLEW_S = 1.5  # a slew is interrupted within this time of its beginning,
 _MEETS_S = 0.1  # and a stall follows within this
 _WRONG = 0.25  # fraction of strikes with wrong values, on devices that can have some
+_AT_TIMES, _LASTS_LONGER = 0.3, 5.0  # fraction of faults that meet only some calls, and last longer
 _AT_ONCE_S = 0.004  # mean delay between hurried commands
 _LONG_STALL, _SILENT = 0.3, 0.5  # fractions of disturbed rests
 _LEARNER, _LEARNS = 0.4, 0.5  # fraction of runs with a learner, and of these, with `learn = "on"`
@@ -83,17 +105,22 @@ class Order(_Happening, frozen=True, kw_only=True, tag="order"):
 
 
 class Strike(_Happening, frozen=True, kw_only=True, tag="strike"):
-    """A fault of one device, and how long it lasts; what happens at once has no duration."""
+    """A fault of one device, and how long it lasts; what happens at once has no duration.
+
+    `part` is the fraction of the calls that it meets.
+    """
 
     device: str
     fault: str
     lasts_s: float = 0.0
     size: float = 0.0
+    part: float = 1.0
 
     @property
     def kind(self) -> str:
         """The name used in the statistics."""
-        return f"{kind_of(self.device)} {self.fault}"
+        at_times = " at times" if self.part < 1.0 else ""
+        return f"{kind_of(self.device)} {self.fault}{at_times}"
 
 
 class Stall(_Happening, frozen=True, kw_only=True, tag="stall"):
@@ -119,6 +146,12 @@ class RecorderDeath(_Happening, frozen=True, kw_only=True, tag="recorder death")
     """The recorder is killed; the supervisor starts a new one."""
 
 
+class RecorderStuck(_Happening, frozen=True, kw_only=True, tag="recorder stuck"):
+    """The recorder neither receives nor writes for a time."""
+
+    lasts_s: float
+
+
 class FullDisk(_Happening, frozen=True, kw_only=True, tag="full disk"):
     """The log's disk is full for a time."""
 
@@ -132,13 +165,25 @@ class ClockStep(_Happening, frozen=True, kw_only=True, tag="clock step"):
 
 
 class Sequence(_Happening, frozen=True, kw_only=True, tag="sequence"):
-    """An operator starts a sequence of steps from `benchmarks.swarm.clients.STEPS`."""
+    """An operator starts a sequence of steps from `benchmarks.swarm.clients.STEPS`, for a loop or all."""
 
     who: str
     steps: list[str]
+    loop: str = ""
 
 
-Happening = Order | Strike | Stall | Kill | Cloud | RecorderDeath | FullDisk | ClockStep | Sequence
+Happening = (
+    Order
+    | Strike
+    | Stall
+    | Kill
+    | Cloud
+    | RecorderDeath
+    | RecorderStuck
+    | FullDisk
+    | ClockStep
+    | Sequence
+)
 
 
 class Plan(msgspec.Struct, frozen=True, kw_only=True):
@@ -264,9 +309,10 @@ def _drawn_strikes(random: Random, rig: str) -> list[Callable[[Random, float], l
         (_kill, 0.3),
         (_cloud, 0.3),
         (_recorder_death, 0.2),
+        (_recorder_stuck, 0.2),
         (_full_disk, 0.2),
         (_clock_step, 0.2),
-        (_sequence, 0.3),
+        (partial(_sequence, loops=loops), 0.3),
     ):
         strikes += [make] * (random.random() < part)
     if random.random() >= _WITHOUT_FAULTS:
@@ -313,13 +359,16 @@ def _strike(random: Random, at_s: float, devices: list[str], faults: list[str]) 
     size = drawn_slowness(random) if fault == "slow" else 0.0
     if kind_of(device) == "piezo" and fault == "stuck":
         size = float(random.randrange(3))
+    at_times = fault in OF_SOME_CALLS and random.random() < _AT_TIMES
+    lasts_s = 10 ** random.uniform(-2.0, 1.0)
     return [
         Strike(
             at_s=at_s,
             device=device,
             fault=fault,
-            lasts_s=0.0 if fault in AT_ONCE else 10 ** random.uniform(-2.0, 1.0),
+            lasts_s=0.0 if fault in AT_ONCE else lasts_s * (_LASTS_LONGER if at_times else 1.0),
             size=size,
+            part=10 ** random.uniform(-2.5, -0.1) if at_times else 1.0,
         )
     ]
 
@@ -419,6 +468,10 @@ def _recorder_death(random: Random, at_s: float) -> list[Happening]:
     return [RecorderDeath(at_s=at_s)]
 
 
+def _recorder_stuck(random: Random, at_s: float) -> list[Happening]:
+    return [RecorderStuck(at_s=at_s, lasts_s=10 ** random.uniform(-1.0, 1.3))]
+
+
 def _full_disk(random: Random, at_s: float) -> list[Happening]:
     return [FullDisk(at_s=at_s, lasts_s=10 ** random.uniform(0.0, 1.3))]
 
@@ -427,6 +480,11 @@ def _clock_step(random: Random, at_s: float) -> list[Happening]:
     return [ClockStep(at_s=at_s, by_s=random.uniform(-2.0, 2.0))]
 
 
-def _sequence(random: Random, at_s: float) -> list[Happening]:
-    steps = [random.choice(_STEPS) for _ in range(random.randint(1, 4))]
-    return [Sequence(at_s=at_s, who=random.choice(OPERATORS), steps=steps)]
+def _sequence(random: Random, at_s: float, loops: tuple[str, ...]) -> list[Happening]:
+    """Of steps of all kinds; half of the sequences acquire first."""
+    kinds = (_STEPS, _CALIBRATING, *((_OF_TESTBED,) if "metrology" in loops else ()))
+    words = [random.choice(random.choice(kinds)) for _ in range(random.randint(1, 4))]
+    steps = " ".join(random.choice(([], ["acquire"])) + words).split()
+    # On a rig with several loops, most steps are for one of them.
+    loop = random.choice((*(loop for loop in loops if loop != "metrology"), ""))
+    return [Sequence(at_s=at_s, who=random.choice(OPERATORS), steps=steps, loop=loop)]

@@ -119,11 +119,16 @@ class SwarmRecorder:
         self._unflushed: list[int] = []
         self._starts = 0
         self._ended = False
+        self._stuck_until_s = 0.0
         self._start()
 
     def end(self) -> None:
         """Stop for good, because the supervisor has ended."""
         self._ended = True
+
+    def stick(self, lasts_s: float) -> None:
+        """Neither receive nor write for a time, as on a disk that hangs."""
+        self._stuck_until_s = max(self._stuck_until_s, self._time.now_s() + lasts_s)
 
     def die(self) -> None:
         """Die, and start again after a second."""
@@ -147,11 +152,14 @@ class SwarmRecorder:
         """Receive all messages, and flush when due. Does nothing if the recorder was restarted meanwhile."""
         if self._ended or start != self._starts or not self._wire.recorder:
             return
+        now_s, goes_on_s = self._time.now_s(), max(self._stuck_until_s, self._time.goes_on_s)
+        if now_s < goes_on_s:
+            self._time.call_at(goes_on_s, lambda: self._take(start))
+            return
         sent = self._wire.sent
         while sent:
             _version, sequence, _record = _sequence_of(sent.popleft())
             self._unflushed.append(sequence)
-        now_s = self._time.now_s()
         if now_s >= self._flush_s and self._unflushed:
             if self.disk_is_full:
                 self.die()
@@ -161,6 +169,10 @@ class SwarmRecorder:
             self._wire.answer(self._unflushed[-1])
             self._unflushed.clear()
         self._time.call_at(now_s + _TAKE_S, lambda: self._take(start))
+
+    def waits_since(self, offered: int) -> int:
+        """How many of the first so many records still wait to be written."""
+        return sum(1 for sequence, _ in self._queue._kept if sequence < offered)
 
     def unaccounted(self) -> str:
         """Report records that are neither written, waiting nor counted as lost; empty without any."""

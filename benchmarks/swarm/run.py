@@ -23,8 +23,8 @@ from benchmarks.swarm.devices.amplifiers import SwarmAmplifiers
 from benchmarks.swarm.devices.hexapod import SwarmHexapod
 from benchmarks.swarm.devices.mirror import SwarmDac, SwarmPiezo
 from benchmarks.swarm.devices.sensors import SwarmCamera, SwarmPhotodiodes
-from benchmarks.swarm.invariants import Invariants, Violation
-from benchmarks.swarm.lines import FAULTS, Bus, Line
+from benchmarks.swarm.invariants import NO_EXCEPTION, Invariants, Violation
+from benchmarks.swarm.lines import Bus, Line
 from benchmarks.swarm.plan import (
     ClockStep,
     Cloud,
@@ -34,6 +34,7 @@ from benchmarks.swarm.plan import (
     Order,
     Plan,
     RecorderDeath,
+    RecorderStuck,
     Sequence,
     Stall,
     Strike,
@@ -76,7 +77,6 @@ from fitctl.stages.periodic import PeriodicThread
 from fitctl.supervisor.supervisor import Supervisor
 
 RIGS = Path(__file__).parents[2] / "rigs"
-NO_EXCEPTION = "no exception escapes"
 HEAL_S = 60.0  # within which a loop must hold its star again
 _HISTORY_S = 20.0  # a frame may come so late, after several stalls in a row
 _ANSWER_S = 5.0
@@ -91,6 +91,8 @@ _NOISE_STEP = 1.05
 _SAVED_S = 1.0  # so often a supervisor leaves where its stars are
 _MISLED_S = 10.0  # for so long after a repeated image, a loop may still follow what it showed
 _BACK_S = 15.0  # after a kill or a shutdown, and what was waited for when all was healed
+_STAY_S = 5.0  # for so long a star that is held must stay so
+_STAYS_PX = 0.5  # mean over a second
 _LEADS_ON: dict[Mode, type[Standby | Recover | Acquire]] = {
     Mode.OFF: Standby,
     Mode.SAFE: Recover,
@@ -231,7 +233,8 @@ class Instrument:
             self._add(f"{name} photodiodes", photodiodes)
             return LoopDevices(amplifiers, photodiodes=photodiodes, bus=bus)
         mirror = SimulatedMirror(part, time, rig, name)  # type: ignore[arg-type]
-        dac = SwarmDac(mirror, time, rig, name, random, self.invariants.volts)
+        written, made_safe = self.invariants.volts, self.invariants.mirror_moved
+        dac = SwarmDac(mirror, time, rig, name, random, written, made_safe)
         piezo = SwarmPiezo(mirror, time, rig, name, random)
         self._add(f"{name} D/A", dac)
         self._add(f"{name} piezo", piezo)
@@ -308,13 +311,17 @@ class Instrument:
         end_s = self.time.now_s() + _WIND_DOWN_S
         while self.time.now_s() < end_s and not supervisor.at_rest():
             supervisor.step()
+            tick()
+        reached = {name for name, each in self.amplifiers.items() if each.line.connected}
         supervisor.close()
+        self.invariants.closed(reached)
         for thread in self._threads:
             thread.stop()
         if self.service is not None:
             self.service.stop()
         self.service = None
         self.answers_due(_ANSWERED_AT_THE_END_S)
+        self._unanswered.clear()  # what arrives now finds nobody, however long the log takes
         self._finish_log()
         self.time.kill_process()
         self._places = []
@@ -343,6 +350,19 @@ class Instrument:
         wrong = self.recorder.unaccounted()
         if wrong:
             self.invariants.violated("a record is written or counted", wrong)
+
+    @property
+    def records_offered(self) -> int:
+        """How many records the supervisor has made."""
+        return self._queue.offered
+
+    def records_written(self, offered: int) -> None:
+        """The recorder has written the first so many records, except those that were lost."""
+        waiting = self.recorder.waits_since(offered)
+        if waiting:
+            self.invariants.violated(
+                "a record is written or counted", f"{waiting} wait for {_STAY_S:g} s or longer"
+            )
 
     def _design(
         self, _rig: Rig, name: str, controller: str, noise_px: float | None = None, /
@@ -390,8 +410,8 @@ class Instrument:
         service.send(SENDERS[who], command, answered)
 
     def _answered(self, life: int, number: int, command: AnyCommand, reply: Reply) -> None:
-        if life != self._lives or not self.running:
-            return  # it was on its way when the supervisor ended
+        if life != self._lives or self.service is None:
+            return  # it was on its way when the service ended
         if self._unanswered.pop(number, None) is None:
             name = type(command).__name__
             self.invariants.violated("a command is answered once", f"{name} {number}: twice")
@@ -441,6 +461,8 @@ class Instrument:
                 self.kill(happening.back_after_s)
             case RecorderDeath():
                 self.recorder.die()
+            case RecorderStuck():
+                self.recorder.stick(happening.lasts_s)
             case FullDisk():
                 self._disk_is_full = True
                 self.time.call_at(self.time.now_s() + happening.lasts_s, self._empty_disk)
@@ -465,9 +487,7 @@ class Instrument:
                 self.amplifiers[loop_name].trip()
             case fault:
                 line = self.lines[strike.device]
-                in_force = line.faults if fault in FAULTS else line.wrong
-                in_force[fault] = strike.size
-                self.time.call_at(self.time.now_s() + strike.lasts_s, partial(line.heal, fault))
+                line.begin(fault, strike.lasts_s, strike.size, strike.part)
 
     def _cut_power(self, name: str) -> None:
         """Restart a loop's encoders at zero; the places of the stars that it turns are unknown from then on.
@@ -499,7 +519,7 @@ class Instrument:
 
     def _start_sequence(self, happening: Sequence) -> None:
         link = Link(self.time, lambda: self.service, SENDERS[happening.who])
-        sequence = RunningSequence(link, self.rig, happening.steps)
+        sequence = RunningSequence(link, self.rig, happening.loop, happening.steps)
         self._sequences.append(sequence)
         self.time.spawn(sequence.run, f"sequence at {happening.at_s:.3f} s", apart=True)
 
@@ -591,6 +611,22 @@ def _told(error: Exception) -> str:
     return f"{type(error).__name__}: {error} ({where})"
 
 
+def _stay(instrument: Instrument) -> None:
+    """Stars that are held stay where they are wanted, and the recorder writes what was recorded before."""
+    time, violated = instrument.time, instrument.invariants.violated
+    offered = instrument.records_offered
+    time.run_until(time.now_s() + _STAY_S)
+    instrument.records_written(offered)
+    for name, loop in instrument.supervisor.loops.items():
+        if loop.mode not in HOLDING:
+            violated("a star that is held stays so", f"{name}: {loop.mode.name}")
+    for name, star in instrument.supervisor.stellar_loops.items():
+        seen_px = instrument.plant.stellar_loops[name].history_px(time.now_s() - 1.0, time.now_s())
+        away_px = np.abs(seen_px[:, 0, 0].mean(axis=0) - star.target_px).max()
+        if star.mode in HOLDING and not away_px <= _STAYS_PX:
+            violated("a star that is held stays so", f"{name}: {away_px:.2f} px from its target")
+
+
 def _recover(instrument: Instrument) -> None:
     """Nothing fails any more: `recover` and `acquire` must hold every star within `HEAL_S`."""
     time = instrument.time
@@ -618,6 +654,8 @@ def _recover(instrument: Instrument) -> None:
     else:
         modes = ", ".join(f"{name} {loop.mode.name}" for name, loop in loops.items())
         instrument.invariants.violated(f"healed, every star is held within {HEAL_S:g} s", modes)
+        return
+    _stay(instrument)
     if instrument.camera.at_other_rate:
         time.run_until(time.now_s() + MOST_RATE_S + 1.0)
         if instrument.camera.at_other_rate:

@@ -34,21 +34,25 @@ def shrunk_from(plan: Plan, violation: Violation, most_runs: float = math.inf) -
         found = run_plan(msgspec.structs.replace(plan, happenings=happenings)).violations
         return any(one.invariant == violation.invariant for one in found)
 
-    happenings, parts = list(plan.happenings), 2
+    happenings, parts, begin = list(plan.happenings), 2, 0
     # Most of what comes after the violation cannot have caused it.
     before = [happening for happening in happenings if happening.at_s <= violation.at_s]
     if 0 < len(before) < len(happenings) and most_runs > 0 and violates(before):
         happenings = before
     while len(happenings) > 1 and runs < most_runs:
         size = -(-len(happenings) // parts)
-        for start in range(0, len(happenings), size):
+        for start in range(begin, len(happenings), size):
             if runs >= most_runs:
                 break
             fewer = happenings[:start] + happenings[start + size :]
             if violates(fewer):
-                happenings, parts = fewer, max(parts - 1, 2)
+                # What was tried before is needed most likely: go on with what follows.
+                happenings, parts, begin = fewer, max(parts - 1, 2), start
                 break
         else:
+            if begin:
+                begin = 0
+                continue
             if size == 1:
                 break
             parts = min(2 * parts, len(happenings))

@@ -139,25 +139,32 @@ class VirtualTime:
         self._stalled_s += added_s
         return self._stalled_until_s, added_s
 
+    @property
+    def goes_on_s(self) -> float:
+        """When a machine that stands still goes on; now, if it does not."""
+        return max(self._now_s, self._stalled_until_s)
+
     def awake_s(self) -> float:
         """For how long the machine has not stood still."""
         still_s = max(0.0, self._stalled_until_s - self._now_s)
         return self._now_s - (self._stalled_s - still_s)
 
-    def park(self, timeout_s: float | None = None) -> None:
-        """Wait to be woken, no longer than a time limit."""
+    def park(self, timeout_s: float | None) -> _Due:
+        """Say until when this thread waits at most; :meth:`wait` waits."""
         if self._over:
             raise GreenletExit
-        mine = None
-        if timeout_s is not None:
-            mine = self._push(self._now_s + timeout_s, getcurrent())
-        self._switch()
-        if mine is not None and not mine.fired:
-            mine.run = None
+        me = getcurrent()
+        return _Due(me) if timeout_s is None else self._push(self._now_s + timeout_s, me)
 
-    def wake(self, thread: greenlet) -> None:
-        """Let a parked thread go on."""
-        self._push(self._now_s, thread)
+    def wait(self) -> None:
+        """Wait until the time limit that :meth:`park` was given, or until this thread is woken."""
+        self._switch()
+
+    def wake(self, parked: _Due) -> None:
+        """Let a parked thread go on now, and not again at its time limit."""
+        if not parked.fired:
+            thread, parked.run = parked.run, None
+            self._push(self._now_s, thread)
 
     def _push(self, time_s: float, run: Any) -> _Due:
         due = _Due(run)
@@ -209,16 +216,16 @@ class _Waiters:
 
     def __init__(self, time: VirtualTime) -> None:
         self.time = time
-        self._waiting: deque[greenlet] = deque()
+        self._waiting: deque[_Due] = deque()
 
     def wait(self, timeout_s: float | None) -> None:
-        me = getcurrent()
-        self._waiting.append(me)
+        mine = self.time.park(timeout_s)
+        self._waiting.append(mine)
         try:
-            self.time.park(timeout_s)
+            self.time.wait()
         finally:
-            if me in self._waiting:
-                self._waiting.remove(me)
+            if mine in self._waiting:
+                self._waiting.remove(mine)
 
     def wake(self, most: int = 1_000_000) -> None:
         while self._waiting and most > 0:

@@ -135,6 +135,11 @@ class Designer(Protocol):
 
         For the last there is :func:`fitctl.controllers.design.document.parameters_json`. An empty `controller`
         is that of the rig file; `noise_px` is the sensor's noise, by default for the light of the rig file.
+
+        Raises
+        ------
+        ConfigError
+            If there is no such design, or it cannot be used with this rig.
         """
 
 

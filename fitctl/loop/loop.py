@@ -30,7 +30,7 @@ from fitctl.messages.modes import (
     usable_commands,
 )
 from fitctl.messages.telemetry import LoopState
-from fitctl.stages.journal import Journal
+from fitctl.stages.journal import Journal, error_text
 from fitctl.stages.periodic import Periodic
 from fitctl.stages.siderostat import SiderostatStage
 
@@ -263,9 +263,10 @@ class Loop(ABC):
 
     def device_failed(self, device: FailingDevice, error: Exception) -> None:
         """Record that a device failed while it was used, and :meth:`fail`."""
-        if str(error) != self._last_failures.get(device):
+        reason = error_text(error)
+        if reason != self._last_failures.get(device):
             self._journal.failure(self.name, device, error)
-        self.fail(device, str(error))
+        self.fail(device, reason)
 
     def _report_event(self, severity: Severity, message: str) -> None:
         self._journal.event(severity, self.name, message)

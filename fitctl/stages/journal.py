@@ -8,10 +8,15 @@ from fitctl.clock import Clock
 from fitctl.drivers.interface import DeviceError
 from fitctl.logging.records import AnyRecord, DeviceFailure, Event, FailingDevice, Severity
 
+NO_MISTAKE = "no error inside fitctl"
+"""What is expected, in the text of every error that neither a device nor an input can cause."""
 
-def error_text(error: BaseException) -> str:
-    """The error's own words for a device's error; with its type for any other."""
-    return str(error) if isinstance(error, DeviceError) else repr(error)
+
+def error_text(error: BaseException, *known: type[Exception]) -> str:
+    """The error's own words for a device's error, or a `known` type; any other is a mistake in fitctl."""
+    if isinstance(error, (DeviceError, *known)):
+        return str(error)
+    return f"expected {NO_MISTAKE}, got {error!r}; report it with the log"
 
 
 class Journal:

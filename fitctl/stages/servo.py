@@ -29,6 +29,7 @@ from fitctl.drivers.interface import (
     ServoAmplifiers,
     ServoReading,
 )
+from fitctl.stages.journal import NO_MISTAKE
 
 Floats = NDArray[np.float64]
 HISTORY_S = 0.3
@@ -343,9 +344,8 @@ class SiderostatServo:
     def _fail(self, error: Exception) -> None:
         self._stopped = True
         if not isinstance(error, DeviceError):
-            expected = "no error inside fitctl"
             hint = "report it with the log; recover"
-            error = DeviceFault(self._device, self.endpoint, expected, repr(error), hint)
+            error = DeviceFault(self._device, self.endpoint, NO_MISTAKE, repr(error), hint)
         self.fault = error
 
     def _no_reading(self) -> DeviceTimeout:

@@ -9,7 +9,7 @@ from functools import partial
 from typing import Any
 
 from fitctl.clock import Clock
-from fitctl.config import Rig
+from fitctl.config import ConfigError, Rig
 from fitctl.controllers.pair import LEARNT, Designer
 from fitctl.loop.stellar import StellarLoop
 from fitctl.messages.commands import LearnerReport, Reply, SetController
@@ -118,7 +118,7 @@ class DesignJobs:
             self._loops[name].use(future.result(), report=report)
             ended(f"controller {controller} is in force", failed=False)
         else:
-            why = error_text(error)
+            why = error_text(error, ConfigError)
             self._journal.event("error", name, f"no design {controller}: {why}")
             ended(f"no design {controller}: {why}", failed=True)
 
@@ -143,7 +143,9 @@ class DesignJobs:
             return
         error = future.exception()
         if error is not None:
-            self._journal.event("warning", loop.name, f"no learnt design: {error_text(error)}")
+            self._journal.event(
+                "warning", loop.name, f"no learnt design: {error_text(error, ConfigError)}"
+            )
         elif loop.learning.wants_change(self._clock.now_s()):
             reason = loop.learning.what_is_gained(report)
             loop.use(future.result(), reason, report=report, by_itself=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import Future
 
-from fitctl.config import Rig
+from fitctl.config import ConfigError, Rig
 from fitctl.controllers.pair import Design
 from fitctl.loop.learning import MOST_NOISE_RATIO
 from fitctl.loop.stellar import StellarLoop
@@ -71,7 +71,9 @@ class Starlight:
         self._remade = None
         if error is not None:
             self._journal.event(
-                "warning", self.loop.name, f"no design for the star's light: {error_text(error)}"
+                "warning",
+                self.loop.name,
+                f"no design for the star's light: {error_text(error, ConfigError)}",
             )
         elif design is before:
             was_px = float(design.parameters["noise_px"])

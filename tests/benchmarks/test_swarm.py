@@ -329,3 +329,39 @@ def test_the_threads_of_a_process_that_is_killed_never_go_on(time):
     time.run_until(2.0)
 
     assert seen == []
+
+
+def test_a_thread_that_is_woken_as_its_time_limit_comes_waits_its_next_wait_in_full(time):
+    event, seen = VirtualEvent(time), []
+
+    def waits():
+        event.wait(1.0)
+        event.clear()
+        for _ in range(2):
+            event.wait(5.0)
+            seen.append(time.now_s())
+
+    time.call_at(1.0, event.set)  # in the instant at which the wait is over
+    time.spawn(waits, "waits")
+    time.run_until(12.0)
+
+    assert seen == [6.0, 11.0]
+
+
+def test_a_thread_that_is_woken_twice_in_one_instant_goes_on_once(time):
+    first, second, seen = VirtualEvent(time), VirtualEvent(time), []
+
+    def waits():
+        first.wait(1.0)
+        second.wait(3.0)
+        seen.append(time.now_s())
+
+    def sets():
+        first.set()
+        first.set()
+
+    time.spawn(waits, "waits")
+    time.call_at(0.5, sets)
+    time.run_until(5.0)
+
+    assert seen == [3.5]

@@ -11,7 +11,7 @@ from benchmarks.swarm.devices.amplifiers import SwarmAmplifiers
 from benchmarks.swarm.devices.hexapod import SwarmHexapod
 from benchmarks.swarm.devices.mirror import SwarmDac, SwarmPiezo
 from benchmarks.swarm.devices.sensors import SwarmCamera, SwarmPhotodiodes
-from benchmarks.swarm.lines import WRONG
+from benchmarks.swarm.lines import WRONG, Line
 from benchmarks.swarm.plan import Order, Plan, Strike, kind_of
 from benchmarks.swarm.run import RIGS as FOLDER
 from benchmarks.swarm.run import run_plan
@@ -145,7 +145,9 @@ def test_a_piezo_amplifier_has_a_stack_at_its_limit_or_another_limit(time, plant
 
 def test_a_dac_whose_watchdog_has_tripped_is_at_its_safe_voltages_and_refuses(time, plant, does):
     mirror = SimulatedMirror(plant.loops["right"], time, RIG, "right")
-    dac = SwarmDac(mirror, time, RIG, "right", Random(1), lambda *_written: None)
+    dac = SwarmDac(
+        mirror, time, RIG, "right", Random(1), lambda *_written: None, lambda _name: None
+    )
     does(dac.open)
     wanted_v = np.array([1.0, 2.0, 3.0])
 
@@ -285,3 +287,33 @@ def test_a_hexapod_that_goes_wrong_under_way_violates_nothing(fault, reported):
 
     assert len(errors) == 1
     assert reported in errors[0]
+
+
+# ------------------------------------------------------------ how long a fault lasts, and which calls it meets
+
+
+def test_a_fault_is_not_cut_short_by_an_earlier_one_of_its_kind(time):
+    line = Line("D/A", "", time, Random(1), 0.001, 0.1)
+    line.begin("mute", 2.0)
+    time.run_until(1.0)
+    line.begin("mute", 3.0)
+
+    time.run_until(3.9)
+    assert "mute" in line.faults
+    time.run_until(4.1)
+    assert line.faults == {}
+
+
+def test_a_fault_of_some_calls_meets_that_fraction_of_them(time, does):
+    line = Line("D/A", "", time, Random(1), 0.001, 0.1)
+    line.open()
+    line.begin("refuses", 60.0, part=0.2)
+    answers = [does(lambda: line.ask(lambda: "done")) for _ in range(500)]
+
+    refused = sum(isinstance(answer, DeviceRefused) for answer in answers)
+    assert answers.count("done") + refused == 500
+    assert 60 <= refused <= 140  # 100 are expected, with a standard deviation of 9
+    assert line.is_bad
+    assert not line.is_silent
+    line.heal()
+    assert not line.is_bad

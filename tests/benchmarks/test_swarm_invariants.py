@@ -3,12 +3,13 @@
 from random import Random
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 from samples.learner_reports import report
 
 from benchmarks.swarm.commands import LEARNT_DESIGNS
 from benchmarks.swarm.devices.hexapod import SwarmHexapod
-from benchmarks.swarm.invariants import Invariants
+from benchmarks.swarm.invariants import NO_EXCEPTION, Invariants
 from benchmarks.swarm.lines import FAULTS, WRONG, Line
 from benchmarks.swarm.past import put_back
 from benchmarks.swarm.plan import Order, Plan, Strike
@@ -26,6 +27,8 @@ from fitctl.messages.modes import Mode
 from fitctl.model.drives import standstill
 from fitctl.model.plant import Plant
 from fitctl.stages.collector import CollectorDrive
+from fitctl.stages.journal import error_text
+from fitctl.stages.servo import SiderostatServo
 from fitctl.supervisor.piezo import PiezoWatch
 
 TESTBED = "fit-testbed.toml"
@@ -57,7 +60,11 @@ class Rig:
         }
         self.plant = Plant(self.rig, [1], history_s=20.0)
         self.jobs = SimpleNamespace(busy=False)
-        self.loops = {name: SimpleNamespace(mode=mode, mode_since_s=0.0) for name in self.rig.loops}
+        self.servo = SimpleNamespace(_wanted_rad=(0.0, 0.0), position_rad=(0.0, 0.0))
+        self.loops = {
+            name: SimpleNamespace(mode=mode, mode_since_s=0.0, servo=self.servo)
+            for name in self.rig.loops
+        }
         self.invariants = Invariants(self.rig, self.time, self.amplifiers, self.lines, self.plant)
         supervisor = SimpleNamespace(loops=self.loops, _device_jobs=self.jobs, piezos={})
         self.invariants.watch(supervisor)
@@ -415,3 +422,105 @@ def test_a_stop_stops_a_collector_whose_start_waits_for_the_same_step():
         Order(at_s=12.002, who="ada", command=Stop()),
     )
     assert run(*happenings, rig=TESTBED, duration_s=18.0) == set()
+
+
+# ------------------------------------------------------------ what is stuck, and what rests
+
+
+STUCK = ["a loop whose motors are stuck is SAFE in time"]
+
+
+def test_a_loop_whose_motors_are_stuck_far_from_where_they_are_sent_must_be_safe_in_time():
+    watched = Rig()
+    watched.lines["right siderostat"].wrong["stuck"] = 0.0
+    watched.servo._wanted_rad = (0.0, -6.0)  # a tenth of a second at full speed
+
+    assert watched.go_on(3.0) == []
+    assert watched.go_on(0.3) == STUCK
+
+
+@pytest.mark.parametrize(
+    ("wrong", "mode", "wanted_rad"),
+    [
+        ({"stuck": 0.0}, Mode.VERNIER, 0.9),  # nearer than what the servo must notice
+        ({"stuck": 0.0}, Mode.SAFE, 6.0),
+        ({}, Mode.VERNIER, 6.0),
+    ],
+)
+def test_motors_that_do_not_move_and_need_not_are_no_violation(wrong, mode, wanted_rad):
+    watched = Rig(mode=mode)
+    watched.lines["right siderostat"].wrong |= wrong
+    watched.servo._wanted_rad = (0.0, wanted_rad)
+
+    assert watched.go_on(8.0) == []
+
+
+def swings(watched, seconds):
+    """Write two voltages in turn, each within the slew."""
+    low_v, high_v = np.full(3, 5.0), np.full(3, 5.2)
+    for _ in range(round(seconds / TICK_S)):
+        watched.go_on(TICK_S)
+        watched.invariants.volts("right", high_v, low_v)
+        low_v, high_v = high_v, low_v
+    return [one.invariant for one in watched.invariants.violations]
+
+
+@pytest.mark.parametrize("mode", [Mode.OFF, Mode.SAFE])
+def test_a_mirror_that_swings_at_rest_is_noticed(mode):
+    watched = Rig(mode=mode)
+
+    assert swings(watched, 1.0) == []
+    assert swings(watched, 0.5) == ["a mirror rests in OFF and SAFE"]
+
+
+def test_a_mirror_may_go_back_to_its_bias_after_its_dac_has_moved_it():
+    watched = Rig(mode=Mode.SAFE)
+    watched.go_on(5.0)
+    watched.invariants.mirror_moved("right")
+
+    assert swings(watched, 1.0) == []
+
+
+def test_amplifiers_that_keep_power_after_an_orderly_end_are_noticed():
+    watched = Rig()
+    watched.go_on(3.0)
+    watched.invariants.closed(reached=set())  # Ensemble whose link is broken
+    assert watched.go_on(0.1) == []
+
+    watched.invariants.closed(reached={"right"})
+    assert watched.go_on(0.1) == ["amplifiers have no power when nobody controls them"]
+
+
+def test_a_mistake_in_fitctl_that_looks_like_a_fault_is_a_violation():
+    watched = Rig()
+    reason = error_text(KeyError("reading"))
+    change = ModeChange(
+        time_s=0.0,
+        loop="right",
+        source="VERNIER",
+        target="SAFE",
+        target_number=0,
+        trigger="FAULT",
+        reason=reason,
+    )
+    watched.invariants.record(change)
+
+    assert watched.go_on(0.1) == [NO_EXCEPTION]
+
+
+@pytest.mark.long
+def test_a_mistake_on_the_servos_thread_is_found_though_it_ends_in_safe(monkeypatch):
+    happenings = (
+        Order(at_s=0.1, who="ada", command=None),
+        Order(at_s=1.0, who="ada", command=None),
+        Strike(at_s=6.0, device="right siderostat", fault="slow", lasts_s=0.1, size=2.0),
+    )
+    assert run(*happenings, duration_s=8.0) == set()
+
+    def mistaken(self, _reading, now_s):
+        if now_s > 7.0:
+            raise KeyError(now_s)
+
+    monkeypatch.setattr(SiderostatServo, "_servo_by", mistaken)
+
+    assert NO_EXCEPTION in run(*happenings, duration_s=8.0)

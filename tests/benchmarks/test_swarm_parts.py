@@ -1,6 +1,7 @@
 """What the swarm has beside the supervisor: recorder, service, console, sequences, and their invariants."""
 
 from random import Random
+from typing import get_args
 
 import msgspec
 import numpy as np
@@ -54,6 +55,7 @@ from fitctl.messages.commands import (
 from fitctl.messages.modes import Mode
 from fitctl.model.drives import standstill
 from fitctl.model.plant import Plant
+from fitctl.sequences.steps import AnyStep
 from fitctl.service.admission import Admission
 from fitctl.stages.servo import SiderostatServo
 from fitctl.tui.state import ConsoleState
@@ -125,6 +127,33 @@ def test_a_record_that_nobody_counts_is_noticed(time, queue):
     queue.lost = 0
 
     assert "0 counted" in recorder.unaccounted()
+
+
+def test_a_recorder_that_is_stuck_writes_all_when_it_goes_on(time, queue):
+    recorder = SwarmRecorder(time, queue)
+    time.run_until(1.0)
+    recorder.stick(3.0)
+    offer(queue, time, 30)
+    time.run_until(3.9)
+    assert recorder.waits_since(30) == 30
+    for _ in range(6):
+        queue.pump()
+        time.run_until(time.now_s() + 0.5)
+
+    assert recorder.waits_since(30) == 0
+    assert recorder.written == set(range(30))
+
+
+def test_a_recorder_stands_still_with_its_machine(time, queue):
+    recorder = SwarmRecorder(time, queue)
+    time.run_until(1.0)
+    offer(queue, time, 5)
+    time.stall(2.0)
+    time.run_until(2.9)
+    assert recorder.written == set()
+    time.run_until(4.0)
+
+    assert recorder.written == set(range(5))
 
 
 # ------------------------------------------------------------ lease and rights
@@ -281,7 +310,9 @@ def test_a_sequence_runs_beside_operators_and_ends():
 def test_the_steps_of_sequences_are_those_that_plans_draw():
     from benchmarks.swarm import plan as plans
 
-    assert set(plans._STEPS) == STEPS.keys()
+    drawn = set(" ".join((*plans._STEPS, *plans._CALIBRATING, *plans._OF_TESTBED)).split())
+    assert drawn == STEPS.keys()
+    assert {type(make("right")) for make in STEPS.values()} == set(get_args(AnyStep))
 
 
 @pytest.mark.long

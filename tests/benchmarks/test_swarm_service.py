@@ -4,7 +4,7 @@ import msgspec
 import pytest
 
 from benchmarks.swarm import service as swarm_service
-from benchmarks.swarm.plan import Kill, Order, Plan
+from benchmarks.swarm.plan import FullDisk, Kill, Order, Plan
 from benchmarks.swarm.run import run_plan
 from fitctl.logging.records import Event
 from fitctl.messages.commands import Shutdown, Standby, Stop, TakeOver
@@ -166,3 +166,17 @@ def test_a_command_that_is_not_answered_before_a_shutdown_is_found(monkeypatch):
     monkeypatch.setattr(Service, "_answer", silent)
 
     assert "Standby of 0.100 s never was" in {one.detail for one in run_plan(short).violations}
+
+
+@pytest.mark.long
+def test_a_command_that_arrives_once_the_service_has_ended_is_owed_no_answer():
+    """Whatever it takes until the log is finished."""
+    happenings = [
+        FullDisk(at_s=1.0, lasts_s=12.0),
+        Order(at_s=2.0, who="ada", command=Shutdown()),
+        # Some of these are answered, some are on their way back, some arrive too late.
+        *(Order(at_s=1.9 + 0.02 * n, who="ben", command=Standby()) for n in range(15)),
+    ]
+    late = msgspec.structs.replace(PLAN, duration_s=12.0, happenings=happenings)
+
+    assert run_plan(late).violations == []

@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 from instruments.simulated import NEAR, SlowExecutor, darken, events_of, failing, until
 
+from fitctl.config import ConfigError
 from fitctl.drivers.interface import DeviceTimeout
 from fitctl.messages.command_table import COMMANDS
 from fitctl.messages.commands import (
@@ -228,16 +229,27 @@ def test_a_lost_star_that_does_not_come_back_in_time_is_a_failure_of_the_search(
     assert "did not come back within 2 s" in failure.text
 
 
+def test_a_mistake_in_the_making_of_a_design_says_what_it_is(fresh, monkeypatch):
+    monkeypatch.setattr(fresh.supervisor._design_jobs, "_design", failing(KeyError("noise_px")))
+
+    found = ended(fresh, fresh.command(SetController(name="lqg-ltr")))
+
+    assert found.text == (
+        "no design lqg-ltr: expected no error inside fitctl, got KeyError('noise_px'); "
+        "report it with the log"
+    )
+
+
 def test_a_design_that_cannot_be_made_fails_and_the_old_one_stays(fresh, monkeypatch):
     before = state(fresh).controller
     monkeypatch.setattr(
-        fresh.supervisor._design_jobs, "_design", failing(ValueError("no such plant"))
+        fresh.supervisor._design_jobs, "_design", failing(ConfigError("no such plant"))
     )
 
     found = ended(fresh, fresh.command(SetController(name="lqg-ltr")))
 
     assert found.state == "failed"
-    assert "no design lqg-ltr: ValueError('no such plant')" in found.text
+    assert "no design lqg-ltr: no such plant" in found.text
     assert state(fresh).last_failure.what == "controller"
     assert state(fresh).controller == before
 

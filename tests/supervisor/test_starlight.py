@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 from instruments.simulated import darken, events_of, until
 
-from fitctl.config import default_rig_path, load_rig
+from fitctl.config import ConfigError, default_rig_path, load_rig
 from fitctl.controllers.centroid import StarSensor, sensor_noise_px
 from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.design.files import save_design
@@ -186,7 +186,7 @@ def test_where_no_design_can_be_made_the_loop_keeps_its_own():
     loop = loop_of(simulation)
     before = loop.pointing.design
     failed = Future()
-    failed.set_exception(ValueError("no solution"))
+    failed.set_exception(ConfigError("no solution"))
 
     Starlight(simulation.rig, loop, loop._journal).designed(0.02, failed)
 

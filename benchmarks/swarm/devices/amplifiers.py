@@ -108,7 +108,7 @@ class SwarmAmplifiers:
         self._watched = False
         self._on_the_way: deque[tuple[float, ServoReading]] = deque()  # with its time of arrival
         self._staged_rad_s: AzEl | None = None
-        self._sync: tuple[float, float, ServoReading | None] | None = None
+        self._sync: tuple[float, float, ServoReading | None, dict[str, float]] | None = None
 
     # ------------------------------------------------------------ the driver
 
@@ -161,10 +161,10 @@ class SwarmAmplifiers:
         velocity_rad_s, self._staged_rad_s = self._staged_rad_s, None
         if velocity_rad_s is None:
             return
-        reading = None
-        if "deaf" not in self.line.faults:
+        reading, faults = None, self.line.of_this_call()
+        if "deaf" not in faults:
             reading = self._hear(velocity_rad_s)
-        self._sync = self._time.now_s(), self.line.delay_s(), reading
+        self._sync = self._time.now_s(), self.line.delay_s(faults), reading, faults
 
     def exchange(self, velocity_rad_s: AzEl) -> ServoReading | None:
         """One servo period: wait at most that long for the encoder reading."""
@@ -175,9 +175,9 @@ class SwarmAmplifiers:
         line, sync, self._sync = self.line, self._sync, None
         if not line.connected or sync is None:
             raise line.broken()
-        sent_s, delay_s, reading = sync
-        if line.faults and line.faults.keys() & _SILENCE:
-            if "garbled" in line.faults:
+        sent_s, delay_s, reading, faults = sync
+        if faults and faults.keys() & _SILENCE:
+            if "garbled" in faults:
                 self._time.sleep_until(sent_s + min(delay_s, self._period_s))
                 raise line.garbled()
             reading = None

@@ -35,6 +35,7 @@ class SwarmDac:
         loop_name: str,
         random: Random,
         written: Callable[[str, Floats, Floats], None],
+        made_safe: Callable[[str], None],
     ) -> None:
         dac = rig.stellar_loops[loop_name].fsm.dac
         _, mocks = rig.mock_parts()
@@ -43,6 +44,7 @@ class SwarmDac:
         self._mirror = mirror
         self._time = time
         self._written = written
+        self._made_safe = made_safe
         settings = mocks.loops[loop_name].dac  # type: ignore[union-attr]
         self._watchdog_s, self._safe_v = settings.watchdog_s, settings.safe_v
         self._written_s = -math.inf
@@ -90,6 +92,7 @@ class SwarmDac:
 
     def _make_safe(self) -> None:
         self._mirror.send_v(np.full(3, self._safe_v))
+        self._made_safe(self.name)
 
     def _outputs_v(self) -> Floats:
         self._refuse_if_tripped()

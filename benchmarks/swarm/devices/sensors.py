@@ -64,7 +64,7 @@ class SwarmCamera(SimulatedCamera):
 
     def next_frame(self, timeout_s: float) -> Frame | None:
         """The next frame, unless a fault withholds it."""
-        faults, now_s = self.line.faults, self._time.now_s()
+        faults, now_s = self.line.of_this_call(), self._time.now_s()
         if not self.line.connected or "unplugged" in faults or "garbled" in faults:
             self._time.sleep(min(timeout_s, 0.01))
             raise self.line.broken()
@@ -158,7 +158,7 @@ class SwarmPhotodiodes(SimulatedPhotodiodes):
 
     def receive(self) -> DiodeReading | None:
         """The newest sample, unless a fault withholds it."""
-        faults = self.line.faults
+        faults = self.line.of_this_call()
         if not self.line.connected or "unplugged" in faults:
             raise self.line.broken()
         if "garbled" in faults:

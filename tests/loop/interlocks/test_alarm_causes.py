@@ -9,6 +9,7 @@ from instruments.simulated import failing
 from interlock_bench import STRIKES, Bench, light, struck
 from samples.replay_courses import two_loops
 
+from fitctl.config import ConfigError
 from fitctl.drivers.interface import DeviceTimeout, DeviceUnreachable
 from fitctl.messages.commands import (
     Acquire,
@@ -214,7 +215,9 @@ def test_standby_that_fails_asks_for_standby_and_is_over_when_it_is_accepted_aga
 def test_a_design_that_cannot_be_made_is_an_alarm_until_another_command():
     bench = Bench()
     bench.replace(
-        bench.supervisor._design_jobs, "_design", lambda _old, *_: failing(ValueError("unstable"))()
+        bench.supervisor._design_jobs,
+        "_design",
+        lambda _old, *_: failing(ConfigError("unstable"))(),
     )
     bench.simulation.command(SetController(name="eq20"))
     bench.run(0.5)
