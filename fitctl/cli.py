@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import importlib
 import os
 import sys
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, NoReturn
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -14,13 +15,15 @@ from typer.exceptions import TyperException
 
 from fitctl import __version__
 from fitctl.commands.shared.examples import EXAMPLES
-from fitctl.commands.shared.exits import INTERRUPTED, UNUSABLE
+from fitctl.commands.shared.exits import FAILED, INTERRUPTED, UNUSABLE
 from fitctl.commands.shared.printing import say, say_lines
 from fitctl.commands.shared.welcome import welcome
 
 # Before numpy comes: its matrices are small here, and threads that wait for each other cost more than they
 # give, above all beside a loop that must not be late.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
 
 
 class Command(NamedTuple):
@@ -178,12 +181,21 @@ def main(arguments: list[str] | None = None) -> None:
         from fitctl.config import ConfigError
         from fitctl.logging.errors import LogError
 
+        if isinstance(error, OSError) and error.errno in _FULL and error.filename is None:
+            _end_output(f"fitctl: its output cannot be written: {error.strerror}")
         if not isinstance(error, ConfigError | LogError):
             raise
         # A rig file's error has a line for each thing that is wrong; a log's is of one line.
         (say_lines if isinstance(error, ConfigError) else say)(str(error), err=True)
         status = UNUSABLE
     sys.exit(status or 0)
+
+
+def _end_output(why: str) -> NoReturn:
+    """End because a disk is full; what is still in the buffer must not fail once more at the exit."""
+    say(f"{why}; free some space, or direct it to another disk", err=True)
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    sys.exit(FAILED)
 
 
 def _message(error: TyperException) -> str:

@@ -169,6 +169,25 @@ def test_ctrl_c_during_the_imports_ends_without_a_traceback(monkeypatch):
     assert end.value.code == 130
 
 
+@pytest.mark.parametrize("arguments", [["--help"], ["check", default_rig_path()]])
+def test_output_that_a_full_disk_refuses_gets_a_clear_line(arguments):
+    with open("/dev/full", "w") as full:
+        result = subprocess.run(
+            [sys.executable, "-m", "fitctl", *arguments],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+
+    assert result.returncode == 1
+    assert result.stderr == (
+        "fitctl: its output cannot be written: No space left on device; free some space, or direct it to "
+        "another disk\n"
+    )
+
+
 @pytest.mark.long
 def test_bad_input_ends_a_process_with_a_clear_line_and_status_2():
     arguments, complaint = BAD_INPUT["an unknown key"]

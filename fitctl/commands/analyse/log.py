@@ -21,7 +21,7 @@ from fitctl.commands.shared.logs import (
     chosen_logs,
     logging_rig,
 )
-from fitctl.commands.shared.options import JsonOption, RigOption, SetOption
+from fitctl.commands.shared.options import JsonOption, OverwriteOption, RigOption, SetOption
 from fitctl.commands.shared.printing import say, to_json
 from fitctl.config import ConfigError
 from fitctl.logging import copying, exporting, folder, verifying
@@ -39,7 +39,6 @@ LogArgument = Annotated[
 LogsArgument = Annotated[
     list[Path] | None, typer.Argument(metavar="LOG...", help="MCAP files, finished or not.")
 ]
-OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Overwrite an existing file.")]
 TopicOption = Annotated[
     list[str] | None,
     typer.Option(

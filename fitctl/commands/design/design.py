@@ -13,7 +13,13 @@ from numpy.typing import ArrayLike
 
 from fitctl.commands.design.learn import learn
 from fitctl.commands.shared.logs import LatestOption, chosen_logs
-from fitctl.commands.shared.options import DesignedRigOption, JsonOption, LoopOption, SetOption
+from fitctl.commands.shared.options import (
+    DesignedRigOption,
+    JsonOption,
+    LoopOption,
+    OverwriteOption,
+    SetOption,
+)
 from fitctl.commands.shared.printing import say_lines, to_json
 from fitctl.commands.shared.rig import require_loop, rig_of
 from fitctl.config import ConfigError, Rig
@@ -69,6 +75,7 @@ def design(
             metavar="FILE", help="Design to write (*.json), for loops.NAME.vernier.controller."
         ),
     ] = None,
+    overwrite: OverwriteOption = False,
 ) -> None:
     """Design the controllers of a loop: margins, residual, and the theoretical minimum of the residual.
 
@@ -77,6 +84,9 @@ def design(
     """
     if out is not None and out.suffix != ".json":
         msg = f"design {what}: --out {out}: must end in .json, or no rig file can name it"
+        raise ConfigError(msg)
+    if out is not None and out.exists() and not overwrite:
+        msg = f"design {what}: --out {out}: exists already; give another name, or pass --overwrite"
         raise ConfigError(msg)
     name = "lqg-ltr" if what == "vernier" else what
     if plot is not None and name != "lqg-ltr":

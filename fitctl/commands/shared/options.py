@@ -34,6 +34,7 @@ SetOption = Annotated[
         "--set", metavar="KEY=VALUE", help="Replace a value of the rig file; may be repeated."
     ),
 ]
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Overwrite an existing file.")]
 RemoteOption = Annotated[
     Path | None,
     typer.Option("--remote", metavar="FILE", help="Key file of a rig on another machine."),

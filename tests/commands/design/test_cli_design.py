@@ -31,6 +31,20 @@ def design(capsys):
 
 
 @pytest.mark.long
+def test_a_design_that_is_there_is_overwritten_only_if_asked_to(design, tmp_path):
+    path = tmp_path / "mine.json"
+    path.write_text("precious")
+
+    status, _, err = design("eq20", "--out", path)
+    assert (status, err) == (
+        2,
+        f"design eq20: --out {path}: exists already; give another name, or pass --overwrite\n",
+    )
+    assert path.read_text() == "precious"
+    assert design("eq20", "--out", path, "--overwrite")[0] == 0
+    assert json.loads(path.read_text())["name"] == "eq20"
+
+
 def test_the_vernier_in_json_has_what_the_paper_prints(design):
     status, out, _ = design("vernier", "--json")
     found = json.loads(out)
