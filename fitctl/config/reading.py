@@ -327,6 +327,11 @@ def _files_of(document: Mapping[str, Any]) -> list[tuple[dict[str, Any], str]]:
 
 def _override(laid: LaidOver, text: str, depth: int) -> None:
     parts, value = parse_override(text, _EXAMPLE)
+    loops = laid.document.get("loops")
+    # One line here; a loop that this key alone would make lacks everything else.
+    if parts[0] == "loops" and len(parts) > 2 and isinstance(loops, dict) and parts[1] not in loops:
+        msg = f"--set {text}: there is no loop {parts[1]}; expected one of {', '.join(loops)}"
+        raise ConfigError(msg)
     table: Any = laid.document
     marks: Any = laid.marks
     for length, part in enumerate(parts[:-1], start=1):

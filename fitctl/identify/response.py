@@ -7,6 +7,7 @@ fit to the complex response.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -226,8 +227,16 @@ def _read_columns(path: Path) -> list[Floats]:
     else:
         with path.open(encoding="utf-8") as stream:
             header = [name.strip() for name in stream.readline().split(",")]
+            missing = [name for name in _COLUMNS if name not in header]
+            if missing:
+                msg = f"its first line does not name {', '.join(missing)}"
+                raise ValueError(msg)
             places = [header.index(name) for name in _COLUMNS]
-            columns = list(np.loadtxt(stream, delimiter=",", usecols=places, unpack=True, ndmin=2))
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # of a file without samples
+                columns = list(
+                    np.loadtxt(stream, delimiter=",", usecols=places, unpack=True, ndmin=2)
+                )
     if len({column.shape for column in columns}) != 1 or columns[0].ndim != 1:
         msg = "columns of unequal length"
         raise ValueError(msg)

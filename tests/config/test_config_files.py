@@ -96,6 +96,7 @@ def test_overrides_replace_values_in_order():
         ("=50", "expected key.path=value"),
         ("camera..x=1", "expected key.path=value"),
         ("camera.width_px.more=1", r"camera\.width_px is not a table"),
+        ("loops.wrong.star_flux_dn=1", "there is no loop wrong; expected one of right"),
         ("plant.loops.right.spots.0.flux_dn=1.0", r"plant\.loops\.right\.spots is not a table"),
         ("camera.frame_rate=50", r"camera\.frame_rate: unknown key; did you mean frame_rate_hz\?"),
         ("camera.frame_rate_hz=fast", r"camera\.frame_rate_hz: must be a valid number \(is 'fast'"),

@@ -198,3 +198,21 @@ def test_a_file_that_is_no_bench_record_is_refused(rig, tmp_path, content):
     path.write_bytes(content)
     with pytest.raises(IdentifyError, match="not a bench record"):
         response.read_bench(path, rig.loops["right"].fsm)
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        ("", "its first line does not name time_s, drive_v, detector_az_v, detector_el_v"),
+        ("time_s,drive_v,detector_az_v\n", "its first line does not name detector_el_v"),
+        ("time_s,drive_v,detector_az_v,detector_el_v\n", "time_s does not rise evenly"),
+    ],
+)
+def test_a_table_without_a_column_or_samples_is_refused_without_a_warning(
+    rig, tmp_path, content, why, recwarn
+):
+    path = tmp_path / "bench.csv"
+    path.write_text(content)
+    with pytest.raises(IdentifyError, match=why):
+        response.read_bench(path, rig.loops["right"].fsm)
+    assert not recwarn.list
