@@ -198,5 +198,6 @@ def _within(
     name: str, value: float, unit: str, least: float = -math.inf, most: float = math.inf
 ) -> Line:
     limit = f"≥ {least:g}" if math.isfinite(least) else f"≤ {most:g}"
-    sign = mark(good=True) if least <= value <= most else text("▲", ORANGE, bold=True)
+    # By the digits that are shown: a learnt design is made to end at its limits.
+    sign = mark(good=True) if least <= round(value, 2) <= most else text("▲", ORANGE, bold=True)
     return [*_figure(name, value, unit), text(f"  {limit} ", DIM), sign]

@@ -355,7 +355,7 @@ def test_margins_are_compared_with_what_is_usual():
         "crossover_hz": 3.9,
         "phase_margin_deg": 22.7,
         "gain_margin_db": 7.1,
-        "peak_sensitivity": 1.9,
+        "peak_sensitivity": 2.001,  # shown as 2.00: the limit
         "attenuation_1hz": 6.1,
         "residual_px": 0.0131,
     }
@@ -363,6 +363,7 @@ def test_margins_are_compared_with_what_is_usual():
     lines = plain(margins.draw(60, 12))
     assert next(line for line in lines if "phase" in line).endswith("▲")
     assert next(line for line in lines if "gain" in line).endswith("✓")
+    assert next(line for line in lines if "sensitivity" in line).endswith("✓")
     assert any("0.0131 px, true star" in line for line in lines)
     figures.accept(at_work, "design: no such loop", 2)
     assert "✗ design: no such loop" in "\n".join(plain(margins.draw(60, 12)))
