@@ -13,7 +13,7 @@ import os
 import sys
 import threading
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -86,15 +86,15 @@ class Totals:
 
     Attributes
     ----------
-    simulated_s : float
     found : list
         A finding for each run that violated something.
     """
 
     def __init__(self) -> None:
-        self.simulated_s = 0.0
         self.found: list[dict[str, object]] = []
-        self._started_s, self._cpu_s, self._runs = time.monotonic(), 0.0, 0
+        self._started_s, self._runs = time.monotonic(), 0
+        self._simulated_s: defaultdict[str, float] = defaultdict(float)  # by rig
+        self._cpu_s: defaultdict[str, float] = defaultdict(float)
         self._kinds: Counter[str] = Counter()
         self._modes: Counter[str] = Counter()
         self._pairs: Counter[tuple[str, str]] = Counter()
@@ -103,8 +103,8 @@ class Totals:
         """Add a run, and print at once what it violated."""
         plan, result, _ = run
         self._runs += 1
-        self.simulated_s += result.lasted_s
-        self._cpu_s += result.cpu_s
+        self._simulated_s[plan.rig] += result.lasted_s
+        self._cpu_s[plan.rig] += result.cpu_s
         self._kinds.update(happening.kind for happening in plan.happenings)
         self._modes.update(result.modes)
         self._pairs.update(met(plan))
@@ -112,19 +112,29 @@ class Totals:
             self.found.append(finding(run))
             print(f"\n{json.dumps(self.found[-1])}", file=sys.stderr, flush=True)
 
+    @property
+    def simulated_s(self) -> float:
+        """Of all runs."""
+        return sum(self._simulated_s.values())
+
     def progress(self, hours: float) -> None:
         """Draw the progress bar."""
         _progress(self.simulated_s / 3600, hours, len(self.found), self._started_s)
 
     def as_object(self, seed: int) -> dict[str, Any]:
         """The object that the command prints."""
-        simulated_s, cpu_s, pairs = self.simulated_s, self._cpu_s, self._pairs
+        simulated_s, cpu_s, pairs = self.simulated_s, sum(self._cpu_s.values()), self._pairs
         return {
             "seed": seed,
             "runs": self._runs,
             "simulated_hours": round(simulated_s / 3600, 3),
             "took_s": round(time.monotonic() - self._started_s, 1),
             "real_time_factor_per_core": round(simulated_s / cpu_s, 1) if cpu_s else None,
+            "real_time_factor_of_rigs": {
+                rig: round(self._simulated_s[rig] / rig_cpu_s, 1)
+                for rig, rig_cpu_s in self._cpu_s.items()
+                if rig_cpu_s
+            },
             "happenings": dict(self._kinds.most_common()),
             "modes_entered": dict(self._modes.most_common()),
             "kinds_that_met_within_1_s": len(pairs),
