@@ -7,6 +7,7 @@ fit to the complex response.
 
 from __future__ import annotations
 
+import io
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.signal import chirp, coherence, csd, welch
 
 from fitctl.config import ARCSEC_PER_RAD, Fsm
+from fitctl.files import open_regular
 from fitctl.identify.drawing import BLACK, BLUE, VERMILION, new_figure
 from fitctl.identify.errors import IdentifyError
 from fitctl.identify.modes_fit import ModesFit, fit_modes, modes_response
@@ -222,10 +224,10 @@ def read_bench(path: Path, fsm: Fsm) -> BenchRecord:
 
 def _read_columns(path: Path) -> list[Floats]:
     if path.suffix == ".npz":
-        with np.load(path) as file:
-            columns = [np.asarray(file[name], dtype=np.float64) for name in _COLUMNS]
+        with open_regular(path) as file, np.load(file) as arrays:
+            columns = [np.asarray(arrays[name], dtype=np.float64) for name in _COLUMNS]
     else:
-        with path.open(encoding="utf-8") as stream:
+        with io.TextIOWrapper(open_regular(path), encoding="utf-8") as stream:
             header = [name.strip() for name in stream.readline().split(",")]
             missing = [name for name in _COLUMNS if name not in header]
             if missing:

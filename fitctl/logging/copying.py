@@ -23,7 +23,7 @@ from mcap.writer import Writer
 
 from fitctl.files import replaced_whole
 from fitctl.logging.errors import LogError
-from fitctl.logging.files import DAMAGE, opened
+from fitctl.logging.files import DAMAGE, Described, opened
 from fitctl.logging.folder import in_use
 
 # A recorder that dies leaves a quarter of logging.queue_records unconfirmed, and that is a million at the most.
@@ -45,19 +45,22 @@ class _Source:
     path: Path
     finished: bool = True
     damaged_chunks: int = 0
+    undescribed: int = 0
     unread_bytes: int = 0
 
     def entries(self) -> Iterator[_Copied | Metadata]:
         """Messages and metadata in the file's order; what is damaged is passed over and counted."""
         with opened(self.path) as (stream, self.finished):
             size = os.fstat(stream.fileno()).st_size
-            schemas: dict[int, Schema] = {}
-            channels: dict[int, Channel] = {}
+            schemas: Described[Schema] = Described(self.path)
+            channels: Described[Channel] = Described(self.path)
             if self.finished:  # the index knows the channels, even those of a damaged chunk
                 with contextlib.suppress(*DAMAGE):
                     summary = SeekingReader(stream).get_summary()
-                    schemas |= summary.schemas if summary else {}
-                    channels |= summary.channels if summary else {}
+                    for schema in summary.schemas.values() if summary else ():
+                        schemas[schema.id] = schema
+                    for channel in summary.channels.values() if summary else ():
+                        channels[channel.id] = channel
                 stream.seek(0)
             read_bytes = 0
             try:
@@ -75,6 +78,8 @@ class _Source:
                             case Message() if record.channel_id in channels:
                                 channel = channels[record.channel_id]
                                 yield _Copied(schemas.get(channel.schema_id), channel, record)
+                            case Message():
+                                self.undescribed += 1
             except DAMAGE:
                 self.unread_bytes = size - read_bytes
 
@@ -106,7 +111,7 @@ class _Target:
             raise LogError(msg)
         self.path = path
         self.records = 0
-        self._metadata: list[Metadata] = []
+        self._metadata: set[tuple[str, tuple[tuple[str, str], ...]]] = set()
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._channels: dict[tuple[str, str, int], int] = {}
 
@@ -126,8 +131,9 @@ class _Target:
     def add(self, entry: _Copied | Metadata) -> None:
         """Copy one entry; metadata that is there already is not added again."""
         if isinstance(entry, Metadata):
-            if entry not in self._metadata:
-                self._metadata.append(entry)
+            known = entry.name, tuple(sorted(entry.metadata.items()))
+            if known not in self._metadata:
+                self._metadata.add(known)
                 self._mcap.add_metadata(entry.name, entry.metadata)
             return
         message = entry.message
@@ -164,12 +170,15 @@ class Recovered:
         Saved.
     damaged_chunks : int
         Passed over; each holds what was recorded between two flushes, at the most.
+    undescribed : int
+        Records of topics whose description only a damaged chunk had: nobody can read them.
     unread_bytes : int
         At the end, from where the file stops making sense.
     """
 
     records: int
     damaged_chunks: int
+    undescribed: int
     unread_bytes: int
 
 
@@ -188,7 +197,9 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
         if not writing.records:
             msg = f"{source}: holds no whole record, so there is nothing to recover"
             raise LogError(msg)
-    return Recovered(writing.records, reading.damaged_chunks, reading.unread_bytes)
+    return Recovered(
+        writing.records, reading.damaged_chunks, reading.undescribed, reading.unread_bytes
+    )
 
 
 def cut(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import importlib
 import re
+from base64 import b64encode
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from foxglove_schemas_protobuf.Log_pb2 import Log
+from numpy.typing import NDArray
 
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import Columns, column_blocks
@@ -29,7 +31,8 @@ def export(path: Path, folder: Path, kind: str, topics: list[str]) -> dict[Path,
 
     Column names are the record's fields, and before them ``log_time_ns`` and ``publish_time_ns``
     (nanoseconds since 1970) and ``sequence``. Frames are ``pixels_dn``: in NumPy shape (frames, height,
-    width), in Parquet little-endian 16 bit, row by row; CSV has no frames.
+    width), in Parquet little-endian 16 bit, row by row; CSV has no frames. Other bytes, such as the snapshots',
+    are Base64 in CSV, and in NumPy one array of all bytes with the lengths beside it, ``NAME_lengths``.
 
     Parameters
     ----------
@@ -79,6 +82,9 @@ def _write_all(
                 / f"{re.sub(r'[^A-Za-z0-9_.-]', '_', topic.strip('/').replace('/', '.'))}.{kind}"
             )
             if topic not in writers:
+                if file in rows:
+                    msg = f"{path}: {topic} and another topic both become {file.name}; export each with --topic"
+                    raise LogError(msg)
                 if file.exists():
                     msg = f"{file}: exists already; give another folder with --out"
                     raise LogError(msg)
@@ -118,9 +124,14 @@ def _csv(file: Path, stack: ExitStack) -> Write:
     def write(columns: Columns) -> None:
         if not stream.tell():
             rows.writerow(columns)
-        rows.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))
+        rows.writerows(zip(*map(_cells, columns.values()), strict=True))
 
     return write
+
+
+def _cells(column: NDArray[Any]) -> list[Any]:
+    values = column.tolist()
+    return [b64encode(value).decode() for value in values] if column.dtype == object else values
 
 
 def _parquet(file: Path, stack: ExitStack) -> Write:
@@ -158,6 +169,10 @@ def _npz(file: Path, stack: ExitStack) -> Write:
                 columns["pixels_dn"] = _images(file, columns)
             except (KeyError, TypeError, ValueError) as error:
                 raise _foreign(f"{file}: the log's frame", error) from None
+        for name in [name for name, column in columns.items() if column.dtype == object]:
+            values = columns[name].tolist()  # NumPy would pickle them, and refuse to read them back
+            columns[name] = np.frombuffer(b"".join(values), np.uint8)
+            columns[f"{name}_lengths"] = np.array([len(value) for value in values], np.int64)
         np.savez_compressed(file, **columns)
 
     def write(columns: Columns) -> None:

@@ -14,7 +14,7 @@ import google.protobuf.message
 import lz4.frame
 import mcap.stream_reader
 import zstandard
-from mcap.exceptions import McapError
+from mcap.exceptions import DecoderNotFoundError, McapError
 from mcap.records import Channel, Schema
 from mcap.writer import MCAP0_MAGIC
 
@@ -124,6 +124,12 @@ def up_to_the_tear(path: Path, finished: bool) -> Iterator[None]:
     """Damage ends a cut file; in a finished file it is an error."""
     try:
         yield
+    except DecoderNotFoundError as error:
+        msg = (
+            f"{path}: has topics in another format ({error}); expected protobuf, as fitctl records them; leave "
+            "them out with --topic"
+        )
+        raise LogError(msg) from error
     except DAMAGE as error:
         if finished:
             msg = f"{path}: is damaged: {error}; {MEND}"

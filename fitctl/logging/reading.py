@@ -40,6 +40,7 @@ _COLUMNS: dict[int, tuple[str, Any]] = {
     FieldDescriptor.CPPTYPE_BOOL: ("b", np.bool_),
     FieldDescriptor.CPPTYPE_STRING: ("", np.str_),
 }
+_MOST_CHARACTERS = 200_000_000  # of a column of texts, of four bytes each
 Columns = dict[str, NDArray[Any]]
 HEADER = ("log_time_ns", "publish_time_ns", "sequence")
 """The columns that every topic has."""
@@ -82,7 +83,9 @@ class LogInfo:
     counts : dict
         Messages by topic.
     metadata : dict
-        The run's description by name: rig, versions, scheduling, clock.
+        The run's description by name: rig, versions, scheduling, clock. Of several runs, the last one's.
+    runs : int
+        How many there are in it: several, where logs of a night were merged. 0 in a log of another program.
     """
 
     path: Path
@@ -91,6 +94,7 @@ class LogInfo:
     end_s: float
     counts: dict[str, int]
     metadata: dict[str, dict[str, str]]
+    runs: int
 
     @property
     def duration_s(self) -> float:
@@ -202,10 +206,10 @@ def column_blocks(
             )
             raise LogError(msg) from None
         if len(block) >= rows:
-            yield entry.topic, block.columns()
+            yield entry.topic, block.columns(f"{path}: {entry.topic}")
             del blocks[entry.topic]
     for topic, block in blocks.items():
-        yield topic, block.columns()
+        yield topic, block.columns(f"{path}: {topic}")
 
 
 def tick_arrays(path: Path, loop: str) -> Columns:
@@ -261,7 +265,17 @@ class _Block:
         for name, column in self._fields:
             column.append(getattr(entry.message, name))
 
-    def columns(self) -> Columns:
+    def columns(self, what: str) -> Columns:
+        """Its columns; an array of texts has room for the longest one in every row."""
+        for name, values in self._values.items():
+            if self._dtypes[name] is np.str_:
+                longest = max(map(len, values), default=0)
+                if longest * len(values) > _MOST_CHARACTERS:
+                    msg = (
+                        f"{what}: a {name} has {longest} characters; expected texts as fitctl records them; "
+                        "choose other topics, or cut that time out with `fitctl log cut`"
+                    )
+                    raise LogError(msg)
         return {
             name: np.array(values, dtype=self._dtypes[name])
             for name, values in self._values.items()
@@ -292,25 +306,33 @@ def log_info(path: Path) -> LogInfo:
     """
     with opened(path) as (stream, finished):
         counts: Counter[str] = Counter()
-        metadata: dict[str, dict[str, str]] = {}
+        described: list[Metadata] = []
         span_ns: list[int] = []  # of the first message, of the last
         with up_to_the_tear(path, finished):
             if finished:
-                span_ns = _read_index(SeekingReader(stream), counts, metadata)
+                span_ns = _read_index(SeekingReader(stream), counts, described)
             else:
-                _scan(stream, counts, metadata, span_ns)
+                _scan(stream, counts, described, span_ns)
     return LogInfo(
         path=path,
         finished=finished,
         start_s=span_ns[0] / 1e9 if span_ns else math.nan,
         end_s=span_ns[-1] / 1e9 if span_ns else math.nan,
         counts=dict(counts),
-        metadata=metadata,
+        metadata={entry.name: entry.metadata for entry in described},
+        runs=len({tuple(entry.metadata.items()) for entry in described if entry.name == "clock"}),
+    )
+
+
+def several_runs(log: LogInfo) -> LogError:
+    """The error for a log of several runs, where one is needed."""
+    return LogError(
+        f"{log.path}: holds {log.runs} runs, as after `fitctl log merge`; expected one; name the log of one"
     )
 
 
 def _read_index(
-    reader: SeekingReader, counts: Counter[str], metadata: dict[str, dict[str, str]]
+    reader: SeekingReader, counts: Counter[str], described: list[Metadata]
 ) -> list[int]:
     summary = reader.get_summary()
     if summary is None or summary.statistics is None:
@@ -319,7 +341,7 @@ def _read_index(
     statistics = summary.statistics
     for channel, number in statistics.channel_message_counts.items():
         counts[summary.channels[channel].topic] += number
-    metadata.update((entry.name, entry.metadata) for entry in reader.iter_metadata())
+    described += reader.iter_metadata()
     if not statistics.message_count:
         return []
     return [statistics.message_start_time, statistics.message_end_time]
@@ -328,7 +350,7 @@ def _read_index(
 def _scan(
     stream: IO[bytes],
     counts: Counter[str],
-    metadata: dict[str, dict[str, str]],
+    described: list[Metadata],
     span_ns: list[int],
 ) -> None:
     topics: dict[int, str] = {}
@@ -336,7 +358,7 @@ def _scan(
         if isinstance(entry, Channel):
             topics[entry.id] = entry.topic
         elif isinstance(entry, Metadata):
-            metadata[entry.name] = entry.metadata
+            described.append(entry)
         elif isinstance(entry, Message):
             counts[topics[entry.channel_id]] += 1
             span_ns[1:] = [entry.log_time]  # the first one stays

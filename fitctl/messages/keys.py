@@ -26,9 +26,10 @@ from fitctl.files import open_regular
 from fitctl.text import UNDECODABLE
 
 Role = Literal["commander", "viewer"]
-KeyText = Annotated[str, msgspec.Meta(pattern=r"^[!-~]{40}$")]  # Z85, 32 bytes
-Name = Annotated[str, msgspec.Meta(pattern=r"^[a-z0-9][a-z0-9_-]{0,31}$")]
+KeyText = Annotated[str, msgspec.Meta(pattern=r"^[!-~]{40}\Z")]  # Z85, 32 bytes
+Name = Annotated[str, msgspec.Meta(pattern=r"^[a-z0-9][a-z0-9_-]{0,31}\Z")]
 PortNumber = Annotated[int, msgspec.Meta(ge=1, le=65535)]
+_AS_OWNER = "run this as the user whose folder it is"
 _HOST = r"^[A-Za-z0-9:][A-Za-z0-9._:%-]*\Z"  # what libzmq connects to
 
 
@@ -105,7 +106,7 @@ def server_pair(rig: Rig) -> KeyPair:
         If it cannot be used or made.
     """
     path = keys_folder(rig) / "server.toml"
-    if not path.exists():
+    if not _exists(path):
         with suppress(FileExistsError):  # another process may have been quicker
             _write_new(path, _new_pair())
     return _read(path, KeyPair)
@@ -156,12 +157,16 @@ def new_key(rig: Rig, name: str, role: Role, host: str, out: Path) -> RemoteKey:
         msg = f"keys: {name!r} cannot be a name ({error}); use a-z, 0-9, - and _, at most 32"
         raise ConfigError(msg) from None
     allowed = _allowed_folder(rig) / f"{name}.toml"
-    if allowed.exists():
+    if _exists(allowed):
         msg = f"keys: there is a key {name} already; revoke it first, or choose another name"
         raise ConfigError(msg)
     try:
         _write_new(out, key)
-        _write_new(allowed, AllowedKey(name=name, role=role, public=pair.public))
+        try:
+            _write_new(allowed, AllowedKey(name=name, role=role, public=pair.public))
+        except BaseException:
+            out.unlink(missing_ok=True)  # it would open nothing
+            raise
     except FileExistsError as error:
         msg = f"{error.filename}: exists already; choose another"
         raise ConfigError(msg) from None
@@ -180,13 +185,24 @@ def revoke_key(rig: Rig, name: str) -> None:
     if name not in known:
         msg = f"keys: no key is named {name}; there are {', '.join(known) or 'none'}"
         raise ConfigError(msg)
-    (_allowed_folder(rig) / f"{name}.toml").unlink(missing_ok=True)
+    path = _allowed_folder(rig) / f"{name}.toml"
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        msg = (
+            f"{path}: cannot be removed: {error.strerror}; the key {name} still opens; {_AS_OWNER}"
+        )
+        raise ConfigError(msg) from None
 
 
 def allowed_keys(rig: Rig) -> tuple[dict[str, AllowedKey], list[str]]:
     """The allowed clients by public key, and what is wrong with key files that cannot be used."""
     keys, problems = {}, []
-    for path in _allowed_paths(rig):
+    try:
+        paths = _allowed_paths(rig)
+    except ConfigError as error:
+        return {}, [str(error)]
+    for path in paths:
         try:
             key = _read(path, AllowedKey)
         except ConfigError as error:
@@ -204,7 +220,11 @@ def allowed_keys(rig: Rig) -> tuple[dict[str, AllowedKey], list[str]]:
 def keys_signature(rig: Rig) -> list[tuple[str, int, int, int]]:
     """Something that changes when an allowed key does; cheap enough to be asked all the time."""
     found = []
-    for path in _allowed_paths(rig):
+    try:
+        paths = _allowed_paths(rig)
+    except ConfigError as error:
+        return [(str(error), 0, 0, 0)]
+    for path in paths:
         with suppress(OSError):
             status = path.stat()
             found.append((path.name, status.st_ino, status.st_mtime_ns, status.st_mode))
@@ -244,7 +264,29 @@ def _allowed_folder(rig: Rig) -> Path:
 
 
 def _allowed_paths(rig: Rig) -> list[Path]:
-    return sorted(_allowed_folder(rig).glob("*.toml"))
+    """The files of the allowed keys.
+
+    Raises
+    ------
+    ConfigError
+        If their folder is there and cannot be read.
+    """
+    folder = _allowed_folder(rig)
+    try:
+        return sorted(folder / name for name in os.listdir(folder) if name.endswith(".toml"))
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        msg = f"{folder}: cannot be read: {error.strerror}; {_AS_OWNER}"
+        raise ConfigError(msg) from None
+
+
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except OSError as error:
+        msg = f"{path}: cannot be read: {error.strerror}; {_AS_OWNER}"
+        raise ConfigError(msg) from None
 
 
 def _new_pair() -> KeyPair:
@@ -293,8 +335,8 @@ def _write_new(path: Path, content: msgspec.Struct) -> None:
             file.flush()
             os.fsync(file.fileno())
             os.link(file.name, path)
-    except FileExistsError:
-        raise FileExistsError(0, "exists", str(path)) from None
     except OSError as error:
+        if isinstance(error, FileExistsError) and error.filename2 is not None:  # of the link
+            raise FileExistsError(0, "exists", str(path)) from None
         msg = f"{path}: cannot be written: {error.strerror}; choose another place"
         raise ConfigError(msg) from None

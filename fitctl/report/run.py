@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from fitctl.config import CONTROLLERS, Rig, is_name, rig_from_log
 from fitctl.logging.errors import LogError
-from fitctl.logging.reading import LogInfo, log_info
+from fitctl.logging.reading import LogInfo, log_info, several_runs
 from fitctl.logging.schemas import designs_of
 
 
@@ -67,6 +67,9 @@ def find_run(paths: Sequence[Path], rig: Rig | None = None) -> Run:
         logs = _newest_run(paths[0])
     else:
         logs = [log_info(path) for path in paths]
+        for log in logs:
+            if log.runs > 1:
+                raise several_runs(log)
         for log in logs[1:]:
             if _identity(log) != _identity(logs[0]):
                 msg = (
@@ -86,7 +89,7 @@ def find_run(paths: Sequence[Path], rig: Rig | None = None) -> Run:
 
 def _newest_run(folder: Path) -> list[LogInfo]:
     logs = [log_info(path) for path in sorted(folder.glob("*.mcap"))]
-    logs = [log for log in logs if "rig" in log.metadata and log.counts]
+    logs = [log for log in logs if "rig" in log.metadata and log.counts and log.runs <= 1]
     if not logs:
         msg = f"{folder}: holds no log of fitctl (*.mcap); name a file, or the rig's logging.folder"
         raise LogError(msg)

@@ -1,4 +1,5 @@
 import dataclasses
+import os
 
 import numpy as np
 import pytest
@@ -216,3 +217,11 @@ def test_a_table_without_a_column_or_samples_is_refused_without_a_warning(
     with pytest.raises(IdentifyError, match=why):
         response.read_bench(path, rig.loops["right"].fsm)
     assert not recwarn.list
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".npz"])
+def test_a_pipe_is_no_bench_record_and_nobody_waits_for_it(rig, tmp_path, suffix):
+    pipe = tmp_path / f"bench{suffix}"
+    os.mkfifo(pipe)
+    with pytest.raises(IdentifyError, match="not a regular file"):
+        response.read_bench(pipe, rig.loops["right"].fsm)

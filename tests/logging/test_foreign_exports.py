@@ -1,10 +1,15 @@
 """What fitctl did not record as it is today is exported rightly, or refused in one line."""
 
+from base64 import b64decode
+from csv import DictReader
+
 import msgspec
+import numpy as np
 import pytest
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.descriptor_pool import DescriptorPool
+from mcap.writer import Writer as PlainWriter
 from mcap_protobuf.writer import Writer
 from samples.log_samples import tick, write_log
 
@@ -89,3 +94,60 @@ def test_a_column_whose_name_npz_does_not_allow_is_refused(tmp_path):
         LogError, match="npz cannot hold a column named file; export csv or parquet"
     ):
         export(path, tmp_path / "out", "npz", ["/other"])
+
+
+@pytest.mark.parametrize("kind", ["csv", "npz", "parquet"])
+def test_two_topics_that_would_become_one_file_are_refused(tmp_path, kind):
+    log = tmp_path / "twins.mcap"
+    with log.open("wb") as stream, Writer(stream) as writer:
+        for number, topic in enumerate((TICKS, "/fit.right.tick")):
+            message = message_of({"number": int}, f"Tick{number}")
+            writer.write_message(topic, message, 10**18, 10**18)
+
+    with pytest.raises(LogError, match=r"and another topic both become fit\.right\.tick"):
+        export(log, tmp_path / "out", kind, [TICKS, "/fit.right.tick"])
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_bytes_are_exported_so_that_they_can_be_read_back_without_pickle(tmp_path):
+    log, topic, states = tmp_path / "states.mcap", "/fit/snapshots", [b"\x00ab", b"", b"\xff"]
+    with log.open("wb") as stream, Writer(stream) as writer:
+        for number, state in enumerate(states):
+            message = message_of({"state_msgpack": bytes}, "State")
+            message.state_msgpack = state
+            writer.write_message(topic, message, 10**18 + number, 10**18 + number)
+
+    export(log, tmp_path / "npz", "npz", [topic])
+    export(log, tmp_path / "csv", "csv", [topic])
+
+    with np.load(tmp_path / "npz" / "fit.snapshots.npz", allow_pickle=False) as file:
+        ends = np.cumsum(file["state_msgpack_lengths"])[:-1]
+        parts = np.split(file["state_msgpack"], ends)
+    assert [part.tobytes() for part in parts] == states
+    with (tmp_path / "csv" / "fit.snapshots.csv").open() as stream:
+        assert [b64decode(row["state_msgpack"]) for row in DictReader(stream)] == states
+
+
+def test_a_text_that_would_need_gigabytes_in_every_row_is_refused(tmp_path):
+    log = tmp_path / "long.mcap"
+    with log.open("wb") as stream, Writer(stream) as writer:
+        for number in range(1000):
+            message = message_of({"message": str}, "Text")
+            message.message = "x" * (1_000_000 if number == 5 else 3)
+            writer.write_message(EVENTS, message, 10**18 + number, 10**18 + number)
+
+    with pytest.raises(LogError, match=r"/fit/events: a message has 1000000 characters"):
+        list(column_blocks(log))
+
+
+def test_a_topic_in_another_format_is_not_called_damage(tmp_path):
+    log = tmp_path / "json.mcap"
+    with log.open("wb") as stream:
+        writer = PlainWriter(stream)
+        writer.start()
+        channel = writer.register_channel("/odo", "json", schema_id=0)
+        writer.add_message(channel, log_time=10**18, data=b"{}", publish_time=10**18)
+        writer.finish()
+
+    with pytest.raises(LogError, match=r"another format .*leave them out with --topic"):
+        list(column_blocks(log))

@@ -1,8 +1,10 @@
 """Recovered, cut and merged logs."""
 
+import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.reader import SeekingReader
 from samples.log_samples import (
     RUN_INFO,
     SETTINGS,
@@ -21,6 +23,8 @@ from fitctl.logging.errors import LogError
 from fitctl.logging.reading import log_info, read_records
 from fitctl.logging.verifying import verify
 from fitctl.logging.writer import LogWriter
+from fitctl.replay.log import whole_run
+from fitctl.report.run import find_run
 
 FOREVER_NS = 2**63
 RECORDS = [RUN_INFO, *(record for n in range(12) for record in (tick(n), frame(n)))]
@@ -204,3 +208,40 @@ def test_a_merged_log_has_every_record_once_in_order(tmp_path_factory, owners, a
     assert [entry.sequence for entry in read_records(target)] == list(range(len(owners)))
     assert verify(target).problems == ()
     assert log_info(target).metadata == log_info(folder / "0.mcap").metadata
+
+
+def test_records_that_only_a_damaged_chunk_describes_are_counted(tmp_path):
+    ticks, frames = map(tick, range(80)), map(frame, range(80, 90))
+    whole = write_log(tmp_path / "whole.mcap", [RUN_INFO, *ticks, *frames], SMALL_CHUNKS)
+    content = bytearray(whole.read_bytes())
+    with whole.open("rb") as stream:
+        summary = SeekingReader(stream).get_summary()
+    first = min(index.chunk_start_offset for index in summary.chunk_indexes)
+    end = max(index.chunk_start_offset + index.chunk_length for index in summary.chunk_indexes)
+    content[first + 200] ^= 255
+    broken = tmp_path / "broken.mcap"
+    broken.write_bytes(content[:end])  # without its index, which describes the topics too
+
+    saved = recover(broken, tmp_path / "recovered.mcap")
+
+    assert saved.damaged_chunks == 1
+    everything = len(contents(whole))
+    assert 0 < saved.undescribed < everything
+    assert saved.records + saved.undescribed < everything  # the rest was in the damaged chunk
+    assert log_info(tmp_path / "recovered.mcap").counts.keys() < log_info(whole).counts.keys()
+
+
+def test_a_log_says_of_how_many_runs_it_is(tmp_path):
+    one = write_log(tmp_path / "one.mcap", RECORDS)
+    later = msgspec.structs.replace(RUN_INFO, time_s=900.0)
+    other = write_log(tmp_path / "other.mcap", [later, *RECORDS[1:]], start_s=WALL_S + 800.0)
+    merge([one, other], tmp_path / "night.mcap")
+
+    assert [log_info(path).runs for path in (one, other, tmp_path / "night.mcap")] == [1, 1, 2]
+    with pytest.raises(LogError, match=r"night\.mcap: holds 2 runs"):
+        find_run([tmp_path / "night.mcap"])
+    with (
+        pytest.raises(LogError, match=r"night\.mcap: holds 2 runs"),
+        whole_run([tmp_path / "night.mcap"]),
+    ):
+        pass

@@ -1,5 +1,6 @@
 """Key files: made once, for their owner's eyes alone, and refused when they are anything else."""
 
+import errno
 import os
 import stat
 
@@ -87,7 +88,9 @@ def test_no_name_is_given_twice_and_no_file_written_over(rig, tmp_path):
     assert len(allowed_keys(rig)[0]) == 1
 
 
-@pytest.mark.parametrize("name", ["", "../x", "Anna", "a b", "x" * 33, "a/b", "root@here", "ä"])
+@pytest.mark.parametrize(
+    "name", ["", "../x", "Anna", "a b", "x" * 33, "a/b", "root@here", "ä", "e\n"]
+)
 def test_a_name_is_never_a_path_nor_a_local_user(rig, tmp_path, name):
     with pytest.raises(ConfigError, match="cannot be a name"):
         new_key(rig, name, "commander", "", tmp_path / "key.toml")
@@ -189,3 +192,37 @@ def test_a_missing_file_a_folder_and_a_pipe_are_told(tmp_path):
     for path in (tmp_path, tmp_path / "none.toml", tmp_path / "pipe"):
         with pytest.raises(ConfigError, match="cannot be read"):
             read_remote(path)
+
+
+def test_a_key_that_cannot_be_allowed_leaves_no_secret_behind(rig, tmp_path):
+    server_pair(rig)
+    (keys_folder(rig) / "allowed").write_text("a file where a folder belongs")
+
+    with pytest.raises(ConfigError, match=r"allowed"):
+        new_key(rig, "anna", "viewer", "", tmp_path / "anna.toml")
+    assert not (tmp_path / "anna.toml").exists()
+
+
+def test_a_folder_of_another_user_is_named_and_lets_nobody_in(rig, tmp_path, monkeypatch):
+    new_key(rig, "anna", "commander", "", tmp_path / "anna.toml")
+
+    def denied(path):
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr(os, "listdir", denied)
+    with pytest.raises(ConfigError, match="Permission denied; run this as the user whose folder"):
+        revoke_key(rig, "anna")
+    keys, problems = allowed_keys(rig)
+    assert keys == {}
+    assert len(problems) == 1
+    assert keys_signature(rig) != []  # the gateway looks again, and reports it
+
+
+def test_a_key_that_cannot_be_removed_is_said_to_open_still(rig, tmp_path):
+    new_key(rig, "anna", "commander", "", tmp_path / "anna.toml")
+    file = keys_folder(rig) / "allowed" / "anna.toml"
+    file.unlink()
+    file.mkdir()
+
+    with pytest.raises(ConfigError, match=r"cannot be removed: .*the key anna still opens"):
+        revoke_key(rig, "anna")

@@ -288,6 +288,8 @@ def recover(
         say(to_json({"log": str(log), "out": str(target), **asdict(saved)}))
         return
     lost = f"{saved.damaged_chunks} damaged chunks skipped, " if saved.damaged_chunks else ""
+    if saved.undescribed:
+        lost += f"{saved.undescribed} records lost that only a damaged chunk describes, "
     say(
         f"{target}: {saved.records} records saved; {lost}{saved.unread_bytes} bytes at the end unreadable"
     )

@@ -155,7 +155,8 @@ def _plot_path(fragment: Path, wanted: Path | None, by: str) -> Path:
 
 
 def _require_writable(path: Path) -> None:
-    if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
+    exists = path.exists()
+    if (exists and not path.is_file()) or not os.access(path if exists else path.parent, os.W_OK):
         msg = f"identify: {path}: nothing can be written there; name another with --out or --plot"
         raise ConfigError(msg)
 
