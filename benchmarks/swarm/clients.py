@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from random import Random
 from typing import Any
 
-from benchmarks.swarm.invariants import Invariants
+from benchmarks.swarm.invariants import ANSWERED_ONCE, Invariants
 from benchmarks.swarm.service import SwarmService
 from benchmarks.swarm.threads import VirtualEvent, VirtualTime
 from fitctl.config import Rig
@@ -41,12 +41,12 @@ STEPS: dict[str, Callable[[str], steps.Step]] = {
     "dark": lambda _: steps.Dark(frames=20),
     "reference": lambda _: steps.Collector(action="reference"),
     "collector": lambda _: steps.Collector(action="start"),
-    "collector_scan": lambda loop: steps.CollectorScan(loop=loop, amplitude_mm=1.0, cycles=1),
+    "collector_scan": lambda _: steps.CollectorScan(loop="left", amplitude_mm=1.0, cycles=1),
     "beam_scan": lambda _: steps.BeamScan(
         loop="metrology", span_sky_arcsec=100.0, slow_sky_arcsec_s=100.0, cycles=1
     ),
     "beam_standby": lambda _: steps.Standby(loop="metrology"),
-    "ambient": lambda _: steps.Ambient(loop="metrology", duration_s=2.0),
+    "ambient": lambda _: steps.Ambient(loop="metrology", duration_s=4.0),
     "visibility": lambda loop: steps.Visibility(loop=loop, duration_s=3.0, settle_s=1.0),
     "overlap": lambda loop: steps.Overlap(loop=loop, **_VISIT),
     "off": lambda loop: steps.Off(loop=loop),
@@ -116,12 +116,20 @@ class Link:
     ----------
     service : callable
         Returns the present service, or None.
+    sender : Sender
+    violated : callable
+        Takes what must not be, and its detail.
     """
 
     def __init__(
-        self, time: VirtualTime, service: Callable[[], SwarmService | None], sender: Sender
+        self,
+        time: VirtualTime,
+        service: Callable[[], SwarmService | None],
+        sender: Sender,
+        violated: Callable[[str, str], None],
     ) -> None:
         self._time = time
+        self._violated = violated
         self._service = service
         self._sender = sender
         self._telemetry: list[Telemetry] = []
@@ -141,14 +149,20 @@ class Link:
             If no reply arrives in time.
         """
         service, answered, replies = self._service(), VirtualEvent(self._time), []
+        name, awake_s = type(command).__name__, self._time.awake_s()
 
         def answer(reply: Reply) -> None:
             replies.append(reply)
             answered.set()
+            if len(replies) > 1:
+                self._violated(ANSWERED_ONCE, f"{name} of a sequence: twice")
 
         if service is not None:
             service.send(self._sender, command, answer)
         if not answered.wait(_REPLY_S):
+            awaited_s = self._time.awake_s() - awake_s
+            if service is not None and service is self._service() and awaited_s >= _REPLY_S:
+                self._violated(ANSWERED_ONCE, f"{name} of a sequence: not within {_REPLY_S:g} s")
             msg = f"no reply within {_REPLY_S:g} s"
             raise ConnectionError(msg)
         return replies[0]

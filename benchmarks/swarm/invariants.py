@@ -35,6 +35,7 @@ from fitctl.messages.commands import (
     Jog,
     Look,
     MoveCollector,
+    Off,
     Recover,
     Reply,
     SetBiasOffset,
@@ -51,6 +52,7 @@ from fitctl.supervisor.supervisor import Supervisor
 
 Floats = NDArray[np.float64]
 NO_EXCEPTION = "no exception escapes"
+ANSWERED_ONCE = "a command is answered once"
 _SLACK = 1.0 + 1e-6
 POWER_S = 1.0  # a loop may have power without need, or need without power, no longer than this
 _AT_REST = frozenset({Mode.OFF, Mode.SAFE})
@@ -306,7 +308,9 @@ class Invariants:
         if isinstance(command, Stop):
             for name in self._named(command):
                 self._stopped_s[name] = self._clock.now_s()
-        elif isinstance(command, SetBiasOffset):
+        elif isinstance(
+            command, SetBiasOffset | Off
+        ):  # the second takes the mirror from its offset
             for name in self._named(command):
                 self.mirror_moved(name)
         elif isinstance(command, Jog):
@@ -580,7 +584,7 @@ class Invariants:
             self._mirror_rests(name, loop, step_v)
 
     def _mirror_rests(self, name: str, loop: Loop, step_v: float) -> None:
-        """In OFF and SAFE a mirror moves to its bias, and again after its D/A has moved it or was silent."""
+        """At rest a mirror moves to its bias, and again after its D/A has moved it or was silent."""
         fsm, line = self._stellar_loops[name].fsm, self._lines[f"{name} D/A"]
         moves_s = max(
             loop.mode_since_s,
@@ -590,13 +594,13 @@ class Invariants:
         )
         rested_s = self._clock.now_s() - moves_s
         if (
-            loop.mode in _AT_REST
+            loop.mode in _SLOWLY
             and not line.is_bad
             and not line.wrong
             and rested_s > fsm.dac.full_scale_v / fsm.slew_v_per_s + _MIRROR_RESTS_S
         ):
             self.violated(
-                "a mirror rests in OFF and SAFE",
+                "a mirror at rest stays where it is",
                 f"{name}: {step_v:.3f} V in one write after {rested_s:.2f} s in {loop.mode.name}",
             )
 
@@ -648,9 +652,8 @@ class Invariants:
         """A loop with a device that has been silent, or has reported a fault, for long is in SAFE or OFF."""
         for device, most_s in self._needed[name]:
             line = self._lines[device]
-            # A slow line, or one that fails at times, has fewer answers that report a fault.
-            seldom = line.at_times or "slow" in line.faults
-            fault = "" if seldom else self._fault_of(name, device)
+            # Over a bad line, fewer answers report a fault.
+            fault = self._fault_of(name, device) if line.is_readable else ""
             states = {
                 "silent": (line.is_silent, line.answered_s),
                 "failing": (fault, line.healed_s),
@@ -686,8 +689,7 @@ class Invariants:
             name,
             is_so="stuck" in line.wrong
             and loop.mode not in _AT_REST
-            and not line.is_bad
-            and line.connected
+            and line.is_readable
             and away_rad > _SURELY * siderostat.servo.following_error_limit_rad,
             now_s=now_s,
             from_s=line.healed_s,

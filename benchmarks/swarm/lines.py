@@ -20,6 +20,7 @@ from fitctl.drivers.interface import (
 Result = TypeVar("Result")
 
 _SLICE_S = 0.0005
+_SELDOM = 0.2  # a device is heard soon enough that fails in no larger part of the calls
 
 FAULTS = ("slow", "deaf", "mute", "refuses", "garbled", "unplugged")
 """Faults of a line, in this order: late answers, lost requests, lost answers, a device that refuses,
@@ -42,8 +43,13 @@ its servos are off.
 """
 SILENCE = frozenset(FAULTS) - {"slow"}
 """Faults during which no answer arrives that makes sense."""
-OF_SOME_CALLS = tuple(fault for fault in FAULTS if fault != "unplugged")
-"""Faults that may meet only some of the calls."""
+OF_SOME_CALLS = (
+    *(fault for fault in FAULTS if fault != "unplugged"),
+    "limit",
+    "saturated",
+    "offset",
+)
+"""Faults that may meet only some of the calls: those of lines, and single wrong values."""
 
 
 class Bus:
@@ -123,31 +129,39 @@ class Line:
         self._time = time
         self._random = random
         self._usual_s = usual_s
-        self._until_s: dict[str, float] = {}
+        self._until_s: dict[tuple[str, bool], float] = {}  # by fault, and whether of some calls
 
     def begin(self, fault: str, lasts_s: float, size: float = 0.0, part: float = 1.0) -> None:
         """Let a fault be in force for a time; one of the same kind that lasts longer is not cut short."""
-        if fault not in FAULTS:
-            self.wrong[fault] = size
-        elif part < 1.0:
+        at_times = part < 1.0 and fault in OF_SOME_CALLS
+        if at_times:
             self.at_times[fault] = part, size
-        else:
+        elif fault in FAULTS:
             self.faults[fault] = size
+        else:
+            self.wrong[fault] = size
         until_s = self._time.now_s() + lasts_s
-        self._until_s[fault] = max(until_s, self._until_s.get(fault, 0.0))
-        self._time.call_at(until_s, partial(self._end, fault, until_s))
+        kind = fault, at_times
+        self._until_s[kind] = max(until_s, self._until_s.get(kind, 0.0))
+        self._time.call_at(until_s, partial(self._end, kind, until_s))
 
-    def _end(self, fault: str, until_s: float) -> None:
-        if self._until_s.get(fault) == until_s:
+    def _end(self, kind: tuple[str, bool], until_s: float) -> None:
+        fault, at_times = kind
+        if self._until_s.get(kind) != until_s:
+            return
+        if at_times:
+            self.at_times.pop(fault, None)
+            self.healed_s = self._time.now_s()
+        else:
             self.heal(fault)
 
     def heal(self, *faults: str) -> None:
-        """End these faults, or all of them if none is named."""
+        """End these faults, or all of them, also of some calls, if none is named."""
         self.healed_s = self._time.now_s()
-        for fault in faults or [*self.faults, *self.at_times, *self.wrong]:
-            self._until_s.pop(fault, None)
+        if not faults:
+            self.at_times.clear()
+        for fault in faults or [*self.faults, *self.wrong]:
             self.faults.pop(fault, None)
-            self.at_times.pop(fault, None)
             if self.wrong.pop(fault, None) is not None:
                 self.wrong_until_s[fault] = self.healed_s
         if not self.faults.keys() & SILENCE:
@@ -163,6 +177,12 @@ class Line:
         """Some calls, or all of them, may fail or take long."""
         return bool(self.faults or self.at_times)
 
+    @property
+    def is_readable(self) -> bool:
+        """Answers arrive in time, at least most of them."""
+        seldom = any(part > _SELDOM for part, _ in self.at_times.values())
+        return self.connected and not (self.faults or seldom)
+
     def of_this_call(self) -> dict[str, float]:
         """The faults of one call: those in force, and, drawn, those that meet only some calls."""
         if not self.at_times:
@@ -170,9 +190,16 @@ class Line:
         drawn = {
             fault: size
             for fault, (part, size) in self.at_times.items()
-            if self._random.random() < part
+            if fault in FAULTS and self._random.random() < part
         }
         return self.faults | drawn
+
+    def is_wrong(self, fault: str) -> bool:
+        """Whether the value of one call is wrong in this way: always meanwhile, or, drawn, at times."""
+        if fault in self.wrong:
+            return True
+        part, _ = self.at_times.get(fault, (0.0, 0.0))
+        return part > 0.0 and self._random.random() < part
 
     @property
     def is_silent(self) -> bool:

@@ -47,6 +47,10 @@ _STEPS = (
     "controller",
     "off",
 )
+_OF_A_LOOP, _OF_ANYBODY = (
+    0.9,
+    0.1,
+)  # fractions of sequences: for one loop; of a viewer, too, who is refused
 _CALIBRATING = ("experiment", "chirp", "plate_scale", "standby dark")
 _OF_TESTBED = (
     "reference collector",
@@ -486,5 +490,7 @@ def _sequence(random: Random, at_s: float, loops: tuple[str, ...]) -> list[Happe
     words = [random.choice(random.choice(kinds)) for _ in range(random.randint(1, 4))]
     steps = " ".join(random.choice(([], ["acquire"])) + words).split()
     # On a rig with several loops, most steps are for one of them.
-    loop = random.choice((*(loop for loop in loops if loop != "metrology"), ""))
-    return [Sequence(at_s=at_s, who=random.choice(OPERATORS), steps=steps, loop=loop)]
+    stars = [loop for loop in loops if loop != "metrology"]
+    loop = random.choice(stars) if random.random() < _OF_A_LOOP else ""
+    who = random.choice(OPERATORS if random.random() < _OF_ANYBODY else OPERATORS[:-1])
+    return [Sequence(at_s=at_s, who=who, steps=steps, loop=loop)]

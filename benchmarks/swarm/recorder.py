@@ -108,6 +108,8 @@ class SwarmRecorder:
         Sequence numbers of the records in its files.
     disk_is_full : bool
         While true, a flush kills the recorder.
+    stuck_until_s : float
+        It neither receives nor writes until then, as on a disk that hangs.
     """
 
     def __init__(self, time: VirtualTime, queue: RecordQueue) -> None:
@@ -119,16 +121,12 @@ class SwarmRecorder:
         self._unflushed: list[int] = []
         self._starts = 0
         self._ended = False
-        self._stuck_until_s = 0.0
+        self.stuck_until_s = 0.0
         self._start()
 
     def end(self) -> None:
         """Stop for good, because the supervisor has ended."""
         self._ended = True
-
-    def stick(self, lasts_s: float) -> None:
-        """Neither receive nor write for a time, as on a disk that hangs."""
-        self._stuck_until_s = max(self._stuck_until_s, self._time.now_s() + lasts_s)
 
     def die(self) -> None:
         """Die, and start again after a second."""
@@ -152,7 +150,7 @@ class SwarmRecorder:
         """Receive all messages, and flush when due. Does nothing if the recorder was restarted meanwhile."""
         if self._ended or start != self._starts or not self._wire.recorder:
             return
-        now_s, goes_on_s = self._time.now_s(), max(self._stuck_until_s, self._time.goes_on_s)
+        now_s, goes_on_s = self._time.now_s(), max(self.stuck_until_s, self._time.goes_on_s)
         if now_s < goes_on_s:
             self._time.call_at(goes_on_s, lambda: self._take(start))
             return

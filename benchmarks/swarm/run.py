@@ -23,7 +23,7 @@ from benchmarks.swarm.devices.amplifiers import SwarmAmplifiers
 from benchmarks.swarm.devices.hexapod import SwarmHexapod
 from benchmarks.swarm.devices.mirror import SwarmDac, SwarmPiezo
 from benchmarks.swarm.devices.sensors import SwarmCamera, SwarmPhotodiodes
-from benchmarks.swarm.invariants import NO_EXCEPTION, Invariants, Violation
+from benchmarks.swarm.invariants import ANSWERED_ONCE, NO_EXCEPTION, Invariants, Violation
 from benchmarks.swarm.lines import Bus, Line
 from benchmarks.swarm.plan import (
     ClockStep,
@@ -84,6 +84,7 @@ _ANSWER_S = 5.0
 _ANSWERED_AT_THE_END_S = 1.5
 _WIND_DOWN_S = 1.0  # as fitctl.daemon.run
 _START_S = 2.0
+_CLOSING_S = 31.0  # the supervisor waits 30 s for its devices
 _LAST_RECORDS_S = 5.0
 _SEQUENCE_ENDS_S = 15.0
 _MOST_DESIGN_S = 20.0
@@ -170,6 +171,11 @@ class Instrument:
         self.modes: dict[str, int] = {}
         self._plan = plan
         self._design_random = self._random("design")
+        # In telemetry, which takes a tenth of the run's time.
+        self._needs_frames = any(
+            isinstance(one, Sequence) and {"dark", "overlap"}.intersection(one.steps)
+            for one in plan.happenings
+        )
         self._designs_take_time = False
         self._on_record = on_record
         self._digest = hashlib.blake2b(digest_size=16)
@@ -178,7 +184,8 @@ class Instrument:
         self._posted = 0
         self._places: list[StarPlace] = []
         self._lives = 0
-        self._disk_is_full = False
+        self._disk_is_full = self._is_healed = False
+        self._recorder_stuck_until_s = 0.0
         self._sequences: list[RunningSequence] = []
         self.found_s: dict[
             str, float
@@ -250,6 +257,7 @@ class Instrument:
         size = self.rig.logging.queue_records
         self._queue = RecordQueue("swarm", size)
         self.recorder = SwarmRecorder(self.time, self._queue)
+        self.recorder.stuck_until_s = self._recorder_stuck_until_s
         self.service: SwarmService | None = None
         self.supervisor = Supervisor(
             self.rig,
@@ -259,7 +267,7 @@ class Instrument:
             self._record,
             self._design,
             design_executor=VirtualExecutor(self.time, "design"),
-            record_frames=False,
+            record_frames=self._needs_frames,
         )
         self.supervisor.recall(self._places)
         self._designs_take_time = True
@@ -313,7 +321,11 @@ class Instrument:
             supervisor.step()
             tick()
         reached = {name for name, each in self.amplifiers.items() if each.line.connected}
+        awake_s = self.time.awake_s()
         supervisor.close()
+        closing_s = self.time.awake_s() - awake_s
+        if closing_s > _CLOSING_S:
+            self.invariants.violated("opening and closing end", f"closing took {closing_s:.1f} s")
         self.invariants.closed(reached)
         for thread in self._threads:
             thread.stop()
@@ -414,7 +426,7 @@ class Instrument:
             return  # it was on its way when the service ended
         if self._unanswered.pop(number, None) is None:
             name = type(command).__name__
-            self.invariants.violated("a command is answered once", f"{name} {number}: twice")
+            self.invariants.violated(ANSWERED_ONCE, f"{name} {number}: twice")
 
     def lead_on(self, who: str, *, from_zero: bool = False) -> None:
         """Give the command that leads every loop on towards its star; `from_zero`, sought about there."""
@@ -442,14 +454,14 @@ class Instrument:
         now_s = self.time.awake_s()
         for since_s, awake_s, name in self._unanswered.values():
             if now_s - awake_s > within_s:
-                self.invariants.violated(
-                    "a command is answered once", f"{name} of {since_s:.3f} s never was"
-                )
+                self.invariants.violated(ANSWERED_ONCE, f"{name} of {since_s:.3f} s never was")
 
     # ------------------------------------------------------------ what happens
 
     def happen(self, happening: Happening) -> None:
-        """Let something happen."""
+        """Let something happen, unless all is being healed."""
+        if self._is_healed:
+            return
         match happening:
             case Order(command=None):
                 self.lead_on(happening.who)
@@ -462,7 +474,9 @@ class Instrument:
             case RecorderDeath():
                 self.recorder.die()
             case RecorderStuck():
-                self.recorder.stick(happening.lasts_s)
+                until_s = self.time.now_s() + happening.lasts_s
+                self._recorder_stuck_until_s = max(self._recorder_stuck_until_s, until_s)
+                self.recorder.stuck_until_s = self._recorder_stuck_until_s
             case FullDisk():
                 self._disk_is_full = True
                 self.time.call_at(self.time.now_s() + happening.lasts_s, self._empty_disk)
@@ -518,7 +532,8 @@ class Instrument:
         self._disk_is_full = False
 
     def _start_sequence(self, happening: Sequence) -> None:
-        link = Link(self.time, lambda: self.service, SENDERS[happening.who])
+        violated = self.invariants.violated
+        link = Link(self.time, lambda: self.service, SENDERS[happening.who], violated)
         sequence = RunningSequence(link, self.rig, happening.loop, happening.steps)
         self._sequences.append(sequence)
         self.time.spawn(sequence.run, f"sequence at {happening.at_s:.3f} s", apart=True)
@@ -537,7 +552,8 @@ class Instrument:
             beam.state.laser[:] = part
 
     def heal(self) -> None:
-        """End every fault."""
+        """End every fault, and let none begin."""
+        self._is_healed = True
         self._dim(1.0)
         self._empty_disk()
         for line in self.lines.values():

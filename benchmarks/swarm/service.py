@@ -243,7 +243,9 @@ class SwarmService(Service):
         """Send what answers there are, publish once more, and end."""
         self._ending.set()
         self._wire.some.set()
-        self._ended.wait(_ENDS_S)
+        awake_s = self._time.awake_s()
+        if not self._ended.wait(_ENDS_S) and self._time.awake_s() - awake_s >= _ENDS_S:
+            self._invariants.violated("a service that is stopped ends", f"not in {_ENDS_S:g} s")
 
     def run(self) -> None:
         """Serve; this is the thread."""

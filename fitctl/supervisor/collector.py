@@ -191,7 +191,7 @@ class CollectorWatch:
                 self._report("info", HEXAPOD, "the collector was stopped where it is")
 
     def _failed(self, error: Exception) -> None:
-        self.error = error_text(error)
+        self.error = error_text(error, ConfigError)
         if not isinstance(error, _STILL_CONNECTED):
             self.is_open = False
             self._hexapod.close()

@@ -317,3 +317,28 @@ def test_a_fault_of_some_calls_meets_that_fraction_of_them(time, does):
     assert not line.is_silent
     line.heal()
     assert not line.is_bad
+
+
+def test_a_fault_of_all_calls_does_not_last_as_long_as_one_of_some(time):
+    line = Line("D/A", "", time, Random(1), 0.001, 0.1)
+    line.begin("mute", 20.0, part=0.01)
+    line.begin("mute", 0.05)
+
+    time.run_until(0.1)
+    assert line.faults == {}
+    assert line.at_times.keys() == {"mute"}
+    time.run_until(20.1)
+    assert not line.is_bad
+
+
+def test_a_wrong_value_may_be_that_of_some_answers(time, plant, does):
+    piezo = SwarmPiezo(
+        SimulatedMirror(plant.loops["right"], time, RIG, "right"), time, RIG, "right", Random(1)
+    )
+    piezo.line.open()
+    piezo.line.begin("limit", 1000.0, part=0.2)
+    answers = [does(piezo.limit_v) for _ in range(300)]
+
+    wrong = sum(isinstance(answer, DeviceMismatch) for answer in answers)
+    assert 30 <= wrong <= 90  # 60 are expected, with a standard deviation of 7
+    assert piezo.line.wrong == {}

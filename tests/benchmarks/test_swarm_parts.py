@@ -1,5 +1,6 @@
 """What the swarm has beside the supervisor: recorder, service, console, sequences, and their invariants."""
 
+from functools import partial
 from random import Random
 from typing import get_args
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from samples.learner_reports import report
 
+from benchmarks.swarm import plan as plans
 from benchmarks.swarm.clients import STEPS
 from benchmarks.swarm.commands import LEARNT_DESIGNS
 from benchmarks.swarm.devices.amplifiers import SwarmAmplifiers
@@ -29,7 +31,7 @@ from benchmarks.swarm.recorder import ZMQ, SwarmRecorder
 from benchmarks.swarm.rigs import RIGS, SLOW, learning, slow_servos
 from benchmarks.swarm.run import RIGS as FOLDER
 from benchmarks.swarm.run import run_plan
-from benchmarks.swarm.service import SENDERS
+from benchmarks.swarm.service import SENDERS, SwarmService
 from benchmarks.swarm.telemetry_wire import RemoteConsole
 from fitctl.config import load_rig
 from fitctl.logging.queue import RecordQueue
@@ -55,6 +57,7 @@ from fitctl.messages.commands import (
 from fitctl.messages.modes import Mode
 from fitctl.model.drives import standstill
 from fitctl.model.plant import Plant
+from fitctl.sequences.contact import Contact
 from fitctl.sequences.steps import AnyStep
 from fitctl.service.admission import Admission
 from fitctl.stages.servo import SiderostatServo
@@ -132,7 +135,7 @@ def test_a_record_that_nobody_counts_is_noticed(time, queue):
 def test_a_recorder_that_is_stuck_writes_all_when_it_goes_on(time, queue):
     recorder = SwarmRecorder(time, queue)
     time.run_until(1.0)
-    recorder.stick(3.0)
+    recorder.stuck_until_s = time.now_s() + 3.0
     offer(queue, time, 30)
     time.run_until(3.9)
     assert recorder.waits_since(30) == 30
@@ -308,11 +311,69 @@ def test_a_sequence_runs_beside_operators_and_ends():
 
 
 def test_the_steps_of_sequences_are_those_that_plans_draw():
-    from benchmarks.swarm import plan as plans
-
     drawn = set(" ".join((*plans._STEPS, *plans._CALIBRATING, *plans._OF_TESTBED)).split())
     assert drawn == STEPS.keys()
     assert {type(make("right")) for make in STEPS.values()} == set(get_args(AnyStep))
+
+
+def ends_of(monkeypatch, happenings, **plan_options):
+    """How each sequence of a plan ended."""
+    ends, end = [], Contact.end
+
+    def noted(self, state, text=""):
+        ends.append(f"{state}{': ' if text else ''}{text}")
+        end(self, state, text)
+
+    monkeypatch.setattr(Contact, "end", noted)
+    assert run_plan(plan(*happenings, **plan_options)).violations == []
+    return ends
+
+
+BY_WORDS = {
+    words: "fit-mock.toml" if words not in plans._OF_TESTBED else "fit-testbed.toml"
+    for words in (*plans._STEPS, *plans._CALIBRATING, *plans._OF_TESTBED)
+    if words != "overlap"  # the plant's fringe spots lie on each other from the beginning
+}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("words", BY_WORDS)
+def test_each_step_that_plans_draw_succeeds_on_a_healthy_rig(monkeypatch, words):
+    sequences = [
+        Sequence(at_s=0.2, who="ada", steps=["acquire"]),
+        Sequence(at_s=50.0, who="ada", steps=words.split(), loop="right"),
+    ]
+    if words.endswith("dark"):
+        sequences.append(Cloud(at_s=49.0, lasts_s=60.0, part=0.0))
+
+    ends = ends_of(monkeypatch, sequences, rig=BY_WORDS[words], duration_s=110.0)
+
+    assert ends == ["done", "done"]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("answers", [0, 2])
+def test_an_answer_that_a_sequence_never_or_twice_receives_is_found(monkeypatch, answers):
+    take = SwarmService._take_answer
+
+    def wrong(self, tag, payload):
+        of_sequence = not isinstance(self._sent[tag][2], partial)  # people's have a number
+        for _ in range(answers if of_sequence else 1):
+            take(self, tag, payload)
+
+    monkeypatch.setattr(SwarmService, "_take_answer", wrong)
+    happenings = [Sequence(at_s=1.0, who="ada", steps=["standby"])]
+
+    found = run_plan(plan(*happenings, duration_s=8.0)).violations
+
+    assert "a command is answered once" in {one.invariant for one in found}
+
+
+@pytest.mark.long
+def test_nothing_begins_once_all_is_being_healed():
+    late = Strike(at_s=36.0, device="camera", fault="mute", lasts_s=60.0)
+
+    assert run_plan(plan(late, duration_s=8.0)).violations == []
 
 
 @pytest.mark.long

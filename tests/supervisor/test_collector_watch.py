@@ -9,7 +9,7 @@ from instruments.c887_settings import MOCK, device
 from serial.urlhandler import protocol_socket
 
 from fitctl.clock import MonotonicClock
-from fitctl.config import Fault, default_rig_path, load_rig
+from fitctl.config import ConfigError, Fault, default_rig_path, load_rig
 from fitctl.drivers.c887.driver import C887Hexapod
 from fitctl.drivers.interface import DeviceTimeout
 from fitctl.messages.commands import MoveCollector, Standby, Stop
@@ -326,3 +326,17 @@ def test_a_supervisor_that_ends_leaves_no_collector_moving():
 def test_a_rig_without_a_collector_refuses_the_command(simulate_with):
     reply = simulate_with().command(MoveCollector(action="start"))
     assert (reply.accepted, reply.text) == (False, "the rig has no collector that moves")
+
+
+def test_a_course_that_cannot_be_read_is_reported_in_its_own_words(watched, monkeypatch):
+    watch, _ = watched
+    why = "collector.motion.file: gone.csv: cannot be read"
+
+    def unreadable(_motion):
+        raise ConfigError(why)
+
+    monkeypatch.setattr(watch.drive, "start", unreadable)
+    assert watch.obey(MoveCollector(action="start")) == ""
+
+    reported(watch, why)
+    assert watch.error == why

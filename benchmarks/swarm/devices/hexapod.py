@@ -79,7 +79,7 @@ class SwarmHexapod(SimulatedHexapod):
         """Read the pose."""
         servos_off = self._servos_off()
         reading = self.line.ask(super().pose)
-        if "offset" in self.line.wrong:
+        if self.line.is_wrong("offset"):
             reading = reading._replace(
                 pose=reading.pose._replace(x_mm=reading.pose.x_mm + _OFFSET_MM)
             )

@@ -150,7 +150,7 @@ class SwarmPiezo:
     def limit_v(self) -> float:
         """Read the limit switch, as the driver does: another limit than the rig file's is an error."""
         limit_v = self.line.ask(self._mirror.limit_v)
-        if "limit" in self.line.wrong:
+        if self.line.is_wrong("limit"):
             raise DeviceMismatch("piezo amplifier", self.line.endpoint, "its limit", "another")
         return limit_v
 

@@ -94,7 +94,7 @@ class SwarmCamera(SimulatedCamera):
             noise_dn = self._plant.pixel_noise_dn(exposed_s)
             self._image = self._scene.frame(spots, self._pixel_key, self._exposures, noise_dn)
         image = self._image
-        if "saturated" in self.line.wrong:
+        if self.line.is_wrong("saturated"):
             image = np.full_like(image, self._full_scale_dn)
         return Frame(self._frames, exposed_s, self._time.now_s(), image)
 
@@ -166,7 +166,7 @@ class SwarmPhotodiodes(SimulatedPhotodiodes):
         self._round_trip_s = self._usual_s * faults.get("slow", 1.0)
         silent = bool(faults.keys() & _SILENCE)
         reading = None if silent else super().receive()
-        if reading is not None and "saturated" in self.line.wrong:
+        if reading is not None and self.line.is_wrong("saturated"):
             reading = reading._replace(volts=(self._range_v,) * 4)
         now_s = self._clock.now_s()
         if reading is not None or not self._requested_s:
