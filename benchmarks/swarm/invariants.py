@@ -614,7 +614,7 @@ class Invariants:
             line = amplifiers.line
             was_well = not line.is_bad and self._clock.now_s() - line.healed_s > _WELL_S
             if amplifiers.powered and name in reached and was_well:
-                self.violated("amplifiers have no power when nobody controls them", name)
+                self.violated("an orderly end disables the amplifiers", name)
 
     # ------------------------------------------------------------ once a tick
 

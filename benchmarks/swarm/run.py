@@ -171,7 +171,7 @@ class Instrument:
         self.modes: dict[str, int] = {}
         self._plan = plan
         self._design_random = self._random("design")
-        # In telemetry, which takes a tenth of the run's time.
+        # To take and encode them costs time; only these steps measure frames.
         self._needs_frames = any(
             isinstance(one, Sequence) and {"dark", "overlap"}.intersection(one.steps)
             for one in plan.happenings

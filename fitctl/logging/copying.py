@@ -171,7 +171,7 @@ class Recovered:
     damaged_chunks : int
         Passed over; each holds what was recorded between two flushes, at the most.
     undescribed : int
-        Records of topics whose description only a damaged chunk had: nobody can read them.
+        Records that cannot be read: only a damaged chunk described their topic.
     unread_bytes : int
         At the end, from where the file stops making sense.
     """

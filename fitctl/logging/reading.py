@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from array import array
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -324,11 +324,23 @@ def log_info(path: Path) -> LogInfo:
     )
 
 
-def several_runs(log: LogInfo) -> LogError:
-    """The error for a log of several runs, where one is needed."""
-    return LogError(
-        f"{log.path}: holds {log.runs} runs, as after `fitctl log merge`; expected one; name the log of one"
-    )
+def logs_of_one_run_each(paths: Sequence[Path]) -> list[LogInfo]:
+    """Describe logs as :func:`log_info` does, where each has to be of one run.
+
+    Raises
+    ------
+    LogError
+        If one cannot be read, or is of several runs.
+    """
+    logs = [log_info(path) for path in paths]
+    for log in logs:
+        if log.runs > 1:
+            msg = (
+                f"{log.path}: holds {log.runs} runs, as after `fitctl log merge`; expected one: name the log "
+                "of one run"
+            )
+            raise LogError(msg)
+    return logs
 
 
 def _read_index(

@@ -277,16 +277,18 @@ def _allowed_paths(rig: Rig) -> list[Path]:
     except FileNotFoundError:
         return []
     except OSError as error:
-        msg = f"{folder}: cannot be read: {error.strerror}; {_AS_OWNER}"
-        raise ConfigError(msg) from None
+        raise _unreadable(folder, error) from None
 
 
 def _exists(path: Path) -> bool:
     try:
         return path.exists()
     except OSError as error:
-        msg = f"{path}: cannot be read: {error.strerror}; {_AS_OWNER}"
-        raise ConfigError(msg) from None
+        raise _unreadable(path, error) from None
+
+
+def _unreadable(path: Path, error: OSError) -> ConfigError:
+    return ConfigError(f"{path}: cannot be read: {error.strerror}; {_AS_OWNER}")
 
 
 def _new_pair() -> KeyPair:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from fitctl.config import Rig
 from fitctl.logging.copying import merge
 from fitctl.logging.errors import LogError
-from fitctl.logging.reading import LogInfo, log_info, read_records, several_runs
+from fitctl.logging.reading import LogInfo, log_info, logs_of_one_run_each, read_records
 from fitctl.logging.records import (
     CAMERA,
     AnyRecord,
@@ -143,11 +143,7 @@ def whole_run(paths: Sequence[Path]) -> Iterator[LogInfo]:
         If a file cannot be read or is damaged, they are of several runs, or what they hold does not begin
         where the run did.
     """
-    logs = [log_info(path) for path in paths]
-    for log in logs:
-        if log.runs > 1:
-            raise several_runs(log)
-    runs = {log.path: log.metadata.get("clock", {}) for log in logs}
+    runs = {log.path: log.metadata.get("clock", {}) for log in logs_of_one_run_each(paths)}
     first = runs[paths[0]]
     for path, run in runs.items():
         if run.get("run_start_monotonic_s") != first.get("run_start_monotonic_s"):

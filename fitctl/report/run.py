@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from fitctl.config import CONTROLLERS, Rig, is_name, rig_from_log
 from fitctl.logging.errors import LogError
-from fitctl.logging.reading import LogInfo, log_info, several_runs
+from fitctl.logging.reading import LogInfo, log_info, logs_of_one_run_each
 from fitctl.logging.schemas import designs_of
 
 
@@ -66,10 +66,7 @@ def find_run(paths: Sequence[Path], rig: Rig | None = None) -> Run:
     if len(paths) == 1 and paths[0].is_dir():
         logs = _newest_run(paths[0])
     else:
-        logs = [log_info(path) for path in paths]
-        for log in logs:
-            if log.runs > 1:
-                raise several_runs(log)
+        logs = logs_of_one_run_each(paths)
         for log in logs[1:]:
             if _identity(log) != _identity(logs[0]):
                 msg = (

@@ -488,7 +488,7 @@ def test_amplifiers_that_keep_power_after_an_orderly_end_are_noticed():
     assert watched.go_on(0.1) == []
 
     watched.invariants.closed(reached={"right"})
-    assert watched.go_on(0.1) == ["amplifiers have no power when nobody controls them"]
+    assert watched.go_on(0.1) == ["an orderly end disables the amplifiers"]
 
 
 def test_a_mistake_in_fitctl_that_looks_like_a_fault_is_a_violation():
