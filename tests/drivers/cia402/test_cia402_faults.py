@@ -4,7 +4,7 @@ import math
 import time
 
 import pytest
-from cia402_bench import Bench, wait_until
+from cia402_bench import Bench, reading_of, wait_until
 
 from fitctl.drivers.cia402 import protocol
 from fitctl.drivers.cia402.driver import Cia402Amplifiers
@@ -189,7 +189,7 @@ def test_a_stuck_axis_is_read_where_it_stands(bench, enabled):
     bench.fault("stuck_axis", part="az")
     stands_rad = bench.motors.position_rad()[0]
     for _ in range(20):
-        reading = enabled.exchange(TURNING)
+        reading = reading_of(enabled, TURNING)
     count_rad = 2 * 3.14159 / bench.siderostat.encoder_counts_per_rev
     assert reading.position_rad[0] == pytest.approx(stands_rad, abs=count_rad)
     assert reading.position_rad[1] > 0
