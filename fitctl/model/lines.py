@@ -91,6 +91,10 @@ def line_motion(
         az_px, el_px = table[line, 3], table[line, 4]
         real, imaginary = state[line, 0], state[line, 1]
         rest = math.sqrt(1 - damping**2)
+        if damping == 0 and since_s == 0:
+            # A damped line before it leaves its amplitude of that instant, which nothing would change.
+            to_rms = math.sqrt(2) / math.hypot(real, imaginary)
+            real, imaginary = to_rms * real, to_rms * imaginary
         for node in range(kicks.shape[0]):
             hz = max(LEAST_HZ, frequency_hz + drift_hz_s * (since_s + node * node_s))
             rad_s = 2 * math.pi * hz

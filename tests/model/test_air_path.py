@@ -43,7 +43,7 @@ def test_the_spectrum_of_eq_9_holds_the_same_variance(air):
     assert math.sqrt(variance) == pytest.approx(air_path.rms_px(air), rel=1e-3)
 
 
-def test_noise_read_as_a_unit_sequence_at_50_hz_would_leave_nothing_to_control(air):
+def test_noise_read_as_a_unit_sequence_at_50_hz_would_be_the_papers_residual_with_control(air):
     a, b, _ = state_space(air)
     held = expm(np.block([[a, b], [np.zeros((1, 3))]]) * 0.02)
     covariance = solve_discrete_lyapunov(held[:2, :2], held[:2, 2:] @ held[:2, 2:].T)

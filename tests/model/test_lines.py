@@ -144,6 +144,20 @@ def test_the_plants_star_moves_by_its_lines_and_all_spots_alike():
     assert np.ptp(apart, axis=0) == pytest.approx([0.0, 0.0], abs=1e-12)
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_a_sine_that_replaces_a_damped_line_has_its_own_rms(seed):
+    later = toml(line(frequency_hz=10.0, damping=0.0)).removeprefix("plant.loops.right.")
+    rig = rig_with(
+        STILL_AIR,
+        toml(line(damping=0.2)),
+        f"plant.timeline=[{{at_s=1.0, loops={{right={{{later}}}}}}}]",
+    )
+    plant = Plant(rig, [seed], star_offset_px=np.zeros((1, 2))).stellar_loops["right"]
+    moved_px = pointing_px(plant, 4.0)[-4000:, 0, 0]  # 2 s
+
+    assert moved_px.std() == pytest.approx(0.05, rel=1e-3)
+
+
 def test_lines_follow_from_the_seed_and_change_nothing_else():
     still, again = (pointing_px(plant_with(toml(line())), 2.0) for _ in range(2))
     beside_others = pointing_px(plant_with(toml(line()), runs=3), 2.0)
