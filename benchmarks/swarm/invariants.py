@@ -42,7 +42,7 @@ from fitctl.messages.commands import (
     Standby,
     Stop,
 )
-from fitctl.messages.modes import FOLLOWING, Mode, Trigger
+from fitctl.messages.modes import FOLLOWING, OPERATOR, Mode, Trigger
 from fitctl.model.drives import experiment_s
 from fitctl.model.optics import motor_sky_rad_per_rad
 from fitctl.model.plant import Plant
@@ -378,8 +378,12 @@ class Invariants:
             self.violated(NO_EXCEPTION, text)
 
     def _controller_changed(self, change: ControllerChange) -> None:
-        """Another design is in force; one with a reason was not chosen by an operator."""
-        if not change.reason or self._supervisor is None or change.target != LEARNT:
+        """Another design is in force; the learner's was not chosen by an operator."""
+        if (
+            change.reason.startswith(OPERATOR)
+            or self._supervisor is None
+            or change.target != LEARNT
+        ):
             return
         loop = self._supervisor.stellar_loops[change.loop]
         if loop.mode is not Mode.VERNIER or loop.learning.setting != "on":

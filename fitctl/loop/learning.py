@@ -6,6 +6,7 @@ a tick. All of it follows from the ticks and the learner's reports, so that a re
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable
 
@@ -28,8 +29,11 @@ PAUSE_S, MOST_PAUSE_S = 60.0, 960.0
 # The mean square of the error, over a time constant, may pass that of the design before by a factor in RMS. The
 # comparison finds later what is worse by less.
 _RMS_LIMITS = ((0.3, 2.0), (10.0, 1.25))
-# A louder night is louder for the design before, too. Beyond so many times, it may as well be a fault.
+# A louder night is louder for the design before, too. Beyond so many times, it may as well be a fault: if the
+# loop is not as designs have it, the disturbance is rebuilt wrongly.
 _LOUDER = 2.0
+# There a frame counts as at most so many times the limit: a gust of a few frames is no fault.
+_MOST_OF_A_FRAME = 5.0
 MOST_NOISE_RATIO = 1.1
 """Another light of the star is another noise of the sensor. One that differs by less is not worth another
 design: minimum-variance leaves 0.3 % more at most."""
@@ -68,8 +72,9 @@ class Learning:
         self._keep = [math.exp(-rig.camera.period_s / over_s) for over_s, _ in _RMS_LIMITS]
         self._means_px2 = [[0.0, 0.0] for _ in _RMS_LIMITS]
         self._before_px2 = [[0.0, 0.0] for _ in _RMS_LIMITS]
+        self._cut_px2 = [[0.0, 0.0] for _ in _RMS_LIMITS]
         self._limit_px = math.inf
-        self._judged_from_s = -math.inf
+        self._judged_from_s = self._compared_from_s = -math.inf
         self._by_hand = False
         self._calm_since_s: float | None = None
         self._paused_until_s = -math.inf
@@ -143,6 +148,10 @@ class Learning:
         )
 
     # ------------------------------------------------------------ changes
+
+    def forget_advice(self) -> None:
+        """The next star is of another light: nothing was learnt for it."""
+        self.report, self._announced = None, 0.0
 
     def changed(
         self,
@@ -226,53 +235,64 @@ class Learning:
             self._judge_from(now_s + CALM_S)
         if is_gap:
             self._calm_since_s = None
-            self._restart_comparison()
-        if hindered or is_other_rate or error_px is None or moved:
+            self._restart_comparison(now_s)
+        if hindered or is_other_rate or error_px is None or moved or saturated:
             self._calm_since_s = None
-            self._restart_comparison()
+            self._restart_comparison(now_s)
             return ""
-        if saturated:
-            self._calm_since_s = None
-            self._restart_comparison()
-        elif self._calm_since_s is None:
+        if self._calm_since_s is None:
             self._calm_since_s = now_s
         if self.in_force is None:
             return ""
-        if self._comparison is not None and not saturated:
+        if self._comparison is not None:
             self._comparison.observe(error_px, *stages_rad)
             error_px = self._comparison.error_px
         return self._why_back(error_px, now_s)
 
     def _judge_from(self, time_s: float) -> None:
-        """Compare the design's residual with its limit from a time on, as if it had left what it promised."""
+        """Judge the design's residual from a time on, as if it had left what it promised."""
         self._judged_from_s = time_s
-        if self.in_force is not None:
-            for means in (*self._means_px2, *self._before_px2):
-                means[:] = [self.in_force.learnt_camera_px**2] * 2
+        self._forget(self._means_px2, self._before_px2, self._cut_px2)
 
-    def _restart_comparison(self) -> None:
+    def _restart_comparison(self, now_s: float) -> None:
+        """Compare with the design before once both have followed the star for a while again."""
+        self._compared_from_s = now_s + CALM_S
+        self._forget(self._means_px2, self._before_px2)
         if self._comparison is not None:
             self._comparison.restart()
 
+    def _forget(self, *of_windows: list[list[float]]) -> None:
+        if self.in_force is not None:
+            for means in itertools.chain(*of_windows):
+                means[:] = [self.in_force.learnt_camera_px**2] * 2
+
     def _why_back(self, error_px: AzEl, now_s: float) -> str:
-        worse = "" if self._comparison is None else self._comparison.why_back
+        comparison = self._comparison
+        worse = "" if comparison is None else comparison.why_back
         if now_s < self._judged_from_s:
             return worse
-        before_px = None if self._comparison is None else self._comparison.before_error_px
-        for (over_s, factor), keep, means, before in zip(
-            _RMS_LIMITS, self._keep, self._means_px2, self._before_px2, strict=True
+        compares = now_s >= self._compared_from_s
+        before_px = error_px if comparison is None else comparison.before_error_px
+        most_px2 = (_MOST_OF_A_FRAME * self._limit_px) ** 2
+        for (over_s, factor), keep, means, before, cut in zip(
+            _RMS_LIMITS, self._keep, self._means_px2, self._before_px2, self._cut_px2, strict=True
         ):
             for axis in (0, 1):
-                means[axis] = keep * means[axis] + (1.0 - keep) * error_px[axis] ** 2
-                if before_px is not None:
+                px2 = error_px[axis] ** 2
+                cut[axis] = keep * cut[axis] + (1.0 - keep) * min(px2, most_px2)
+                if compares:
+                    means[axis] = keep * means[axis] + (1.0 - keep) * px2
                     before[axis] = keep * before[axis] + (1.0 - keep) * before_px[axis] ** 2
-            rms_px = math.sqrt(max(means))
-            louder_px = min(math.sqrt(max(before)), _LOUDER * self._limit_px)
-            limit_px = max(self._limit_px, louder_px)
-            if rms_px > factor * limit_px:
+            limit_px = max(self._limit_px, math.sqrt(max(before)))
+            if max(means) > (factor * limit_px) ** 2:
                 worse = (
-                    f"the learnt design leaves {rms_px:.4f} px on frames over {over_s:g} s; the design before "
-                    f"left {limit_px:.4f}"
+                    f"the learnt design leaves {math.sqrt(max(means)):.4f} px on frames over {over_s:g} s; the "
+                    f"design before left {limit_px:.4f}"
+                )
+            elif max(cut) > (factor * _LOUDER * self._limit_px) ** 2:
+                worse = (
+                    f"the learnt design leaves {math.sqrt(max(cut)):.4f} px on frames over {over_s:g} s; the "
+                    f"design before left {self._limit_px:.4f}, and no night is so much louder"
                 )
         return worse
 

@@ -22,6 +22,7 @@ from fitctl.loop.interlocks import Interlocks
 from fitctl.loop.quantities import Quantities
 from fitctl.messages.commands import Acquire, AnyCommand
 from fitctl.messages.modes import (
+    OPERATOR,
     TRANSITIONS,
     Mode,
     Transition,
@@ -203,7 +204,7 @@ class Loop(ABC):
         """Fire what a command is for; a search is made as it asks."""
         if isinstance(command, Acquire):
             self.configure_search(command)
-        self.fire(trigger, "operator")
+        self.fire(trigger, OPERATOR)
 
     def configure_search(self, asked: Acquire) -> None:  # noqa: B027 - a loop may search for nothing
         """How the next search, and no other, is to be made, as a command asks that was not refused."""

@@ -403,10 +403,14 @@ class StellarLoop(Loop):
         noise_px, before_px = map(
             self.star_finder.noise_px, (flux_dn, self.quantities.star_flux_dn)
         )
-        if self.learning.before and is_other_light(noise_px, before_px):
-            # Of the design before, another can be made for the new star's light.
-            why = f"the next star has {flux_dn:g} DN, and the learnt design is for another light"
-            self.use(self.learning.before, why, by_itself=True)
+        if is_other_light(noise_px, before_px):
+            self.learning.forget_advice()
+            if self.learning.before:
+                # Of the design before, another can be made for the new star's light.
+                why = (
+                    f"the next star has {flux_dn:g} DN, and the learnt design is for another light"
+                )
+                self.use(self.learning.before, why, by_itself=True)
         self.star_finder.expect_flux(flux_dn)
         self.quantities.star_flux_dn = flux_dn
         self._expect_rate(asked)
@@ -428,8 +432,11 @@ class StellarLoop(Loop):
     def _start_search(self, motor_rad: Floats) -> None:
         """As asked; else about where the star is expected: on the target, or where it was last seen."""
         again, self._search_due = bool(self._search_due), None
-        if self.link is not None and not self._link_counts:
-            # What the link's siderostat turned before, to find its beam, moved no star that was known.
+        if self.link is not None and not (
+            self._link_counts and self.search.asked_place_sky_arcsec is None
+        ):
+            # What the link's siderostat turned before, to find its beam, moved no star that was known. A place
+            # that a command gives is one with the link as it is now.
             self.link.set_origin()
             if not self._is_recalled:
                 self.star_finder.estimator.forget()

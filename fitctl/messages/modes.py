@@ -10,6 +10,9 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
 
+OPERATOR = "operator"
+"""The reason of a change of mode or design that a command asked for."""
+
 
 class Mode(IntEnum):
     """What a loop is doing; the number is what logs carry."""

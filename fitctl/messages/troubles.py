@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
 from fitctl.logging.records import DeviceHealth
-from fitctl.messages.modes import Mode
+from fitctl.messages.modes import OPERATOR, Mode
 from fitctl.messages.telemetry import LoopState, Telemetry, TrippedInterlock
 
 FIND_STAR = "check shutter and clouds; release, stop or acquire ends the search"
@@ -152,7 +152,7 @@ def _of_safe(loop: LoopState) -> Iterator[Trouble]:
     if not fault and loop.last_failure is not None:
         return  # a stop ended a command, whose failure says so
     what, todo = _parted(reason)
-    if reason == "operator":
+    if reason == OPERATOR:
         what, todo = "stopped by the operator", "recover, or off"
     yield Trouble(
         _cause(reason) if fault else f"{loop.name} SAFE",

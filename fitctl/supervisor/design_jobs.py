@@ -13,6 +13,7 @@ from fitctl.config import ConfigError, Rig
 from fitctl.controllers.pair import LEARNT, Designer
 from fitctl.loop.stellar import StellarLoop
 from fitctl.messages.commands import LearnerReport, Reply, SetController
+from fitctl.messages.modes import OPERATOR
 from fitctl.stages.journal import Journal, error_text
 from fitctl.supervisor.device_jobs import Ended, Job
 from fitctl.supervisor.outcomes import Outcomes
@@ -115,7 +116,12 @@ class DesignJobs:
             return  # another command replaced it
         error = future.exception()
         if error is None:
-            self._loops[name].use(future.result(), report=report)
+            loop = self._loops[name]
+            reason = OPERATOR
+            if report is not None:
+                gains = loop.learning.what_is_gained(report) if report.worth_it else report.text
+                reason = f"{OPERATOR}; {gains}"
+            loop.use(future.result(), reason, report=report)
             ended(f"controller {controller} is in force", failed=False)
         else:
             why = error_text(error, ConfigError)

@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 from fitctl.drivers.interface import DeviceIdentity, Devices
 from fitctl.logging.records import DevicesOpened, Severity
 from fitctl.loop.loop import Loop
-from fitctl.messages.modes import Mode, Trigger
+from fitctl.messages.modes import OPERATOR, Mode, Trigger
 from fitctl.stages.journal import Journal, error_text
 from fitctl.supervisor.camera_watch import CameraWatch
 from fitctl.supervisor.piezo import PiezoWatch
@@ -110,7 +110,7 @@ class DeviceJobs:
         """Close the devices of these loops for OFF, then call `ended`."""
         for name in names:
             self._loops[name].release()
-            self._loops[name].fire(Trigger.OFF, "operator")
+            self._loops[name].fire(Trigger.OFF, OPERATOR)
         self._forget_piezos(names)
         # The camera serves all loops; the last one out turns it off.
         with_camera = all(loop.mode is Mode.OFF for loop in self._loops.values())

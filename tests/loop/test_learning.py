@@ -138,6 +138,7 @@ def test_the_operator_applies_what_was_advised():
     assert not refused.accepted
     assert "nothing is learnt of loop right yet" in refused.text
     assert night.loop.controller == "learnt"
+    assert night.changes()[-1].reason.startswith("operator; a design learnt from")
 
 
 def test_parameters_without_margins_are_refused():
@@ -392,6 +393,73 @@ def test_a_star_that_is_caught_again_is_no_reason_to_go_back():
     night.simulation.run(6.0)
 
     assert len(night.changes()) == 1
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("lasts_s", [0.02, 0.04, 0.1])
+def test_a_gust_is_no_reason_to_go_back(lasts_s):
+    night = learnt_design_at_work()
+    part = night.simulation.plants["right"]
+    begin_block, gusts = part.begin_block, iter([True])
+
+    def with_a_gust():
+        begin_block()
+        if next(gusts, False):
+            part._air_px[: round(lasts_s / part.constants.step_s), :, 0] += 1.0
+
+    part.begin_block = with_a_gust
+    night.simulation.run(15.0)
+
+    assert np.abs(night.error_px(15.0)).max() > 0.9
+    assert [change.reason for change in night.changes()[1:]] == []
+
+
+def observe_frames(learning, errors_px, *, saturated=False, from_s=0.0):
+    """Frames of a star at rest on its target; the reasons to go back."""
+    return [
+        reason
+        for number, error_px in enumerate(errors_px)
+        if (
+            reason := learning.observe(
+                from_s + 0.02 * number,
+                from_s + 0.02 * number - 0.02,
+                (error_px, 0.0),
+                (28.0, 20.0),
+                (np.zeros(2), np.zeros(2)),
+                saturated=saturated,
+                hindered=False,
+            )
+        )
+    ]
+
+
+def test_nothing_is_judged_while_the_mirror_is_saturated():
+    rig = load_rig(default_rig_path())
+    before, now = design_minimum_variance(PAPER), design_with_margins(PAPER)
+    learning = Learning(rig, "right")
+    learning.changed(
+        before, now, report(measured_px=0.016, learnt_camera_px=0.016), (), by_itself=True
+    )
+
+    assert observe_frames(learning, [0.016] * 100) == []
+    assert observe_frames(learning, [2.0] * 100, saturated=True, from_s=2.0) == []
+    assert observe_frames(learning, [0.016] * 1000, from_s=4.0) == []
+    assert observe_frames(learning, [0.5] * 50, from_s=24.0)[0].startswith(
+        "the learnt design leaves"
+    )
+
+
+@pytest.mark.long
+def test_advice_for_one_star_is_not_for_a_star_of_another_light():
+    night = Night("loops.right.vernier.controller=minimum-variance", learn="advise")
+    night.report(design_json=parameters_json(design_with_margins(PAPER)))
+    assert night.loop.state(0.0).learning.state == "advice"
+    for command in (Release(), Acquire(star_flux_dn=14_000.0)):
+        assert night.simulation.command(command).accepted
+        night.simulation.run(0.1)
+
+    reply = night.simulation.command(SetController(name="learnt"))
+    assert (reply.accepted, night.loop.state(0.0).learning.state) == (False, "collecting")
 
 
 @pytest.mark.long

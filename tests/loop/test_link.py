@@ -16,6 +16,7 @@ from fitctl.messages.commands import (
     Stop,
 )
 from fitctl.messages.modes import Mode
+from fitctl.model.optics import ARCSEC_PER_RAD, motor_sky_rad_per_rad
 from fitctl.simulation.simulation import Simulation
 from fitctl.simulation.statistics import true_residual_rms
 
@@ -365,3 +366,22 @@ def test_what_was_turned_before_the_links_encoders_lost_their_zero_is_not_undone
     assert held.loop(LEFT).siderostat.setpoint_rad == pytest.approx(stood_rad, abs=0.3)
     held.run(3.0)
     held.until(limit_s=20.0, left=Mode.VERNIER)
+
+
+def test_a_place_that_a_command_gives_is_one_with_the_link_as_it_is(held):
+    """It is that of the siderostat's own encoders, wherever the link's siderostat has turned."""
+    held.drift(0.3)
+    held.run(30.0)
+    siderostat = held.loop(LEFT).settings.siderostat
+    arcsec_per_rad = motor_sky_rad_per_rad(siderostat) * ARCSEC_PER_RAD
+    az_arcsec, el_arcsec = (-arcsec_per_rad * held.loop(LEFT).servo.position_rad).tolist()
+    assert held.command(Release(loop=LEFT)).accepted
+    held.run(0.5)
+    asked = Acquire(
+        loop=LEFT,
+        search_radius_sky_arcsec=20.0,
+        expected_az_sky_arcsec=az_arcsec,
+        expected_el_sky_arcsec=el_arcsec,
+    )
+    assert held.command(asked).accepted
+    held.until(8.0, left=Mode.VERNIER)

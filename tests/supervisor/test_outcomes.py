@@ -280,7 +280,7 @@ def test_a_newer_controller_command_replaces_one_whose_design_is_not_there_yet(f
         "controller minimum-variance is in force",
     ]
     changed = [event.message for event in events_of(fresh) if "controller" in event.message]
-    assert changed == [f"controller {before} -> minimum-variance"]
+    assert changed == [f"controller {before} -> minimum-variance: operator"]
 
 
 def test_amplifiers_that_do_not_close_well_fail_off(fresh, monkeypatch):

@@ -137,7 +137,7 @@ def test_a_design_chosen_by_hand_is_for_the_light_too():
     simulation.run(3.0)
 
     first, second = changes_of(simulation)
-    assert (first.target, first.reason) == ("minimum-variance", "")
+    assert (first.target, first.reason) == ("minimum-variance", "operator")
     assert "0.0401 px" in second.reason
 
 

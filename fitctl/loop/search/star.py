@@ -21,6 +21,10 @@ from fitctl.model.optics import scales
 Floats = NDArray[np.float64]
 _SLEWS = 10.0  # the siderostat may take as many times as long to begin as its limits would let it
 NEAR = 0.5  # of the field's radius: so near to its middle the siderostat must be before the spiral begins
+_CHECK_COLLECTOR = (
+    "shutter and pointing, and bring the collector back with fitctl send collector reference if it moved while "
+    "its beam was not held"
+)
 _STAR = Wanted(
     name="star",
     found=Trigger.STAR_FOUND,
@@ -64,7 +68,10 @@ class StarSearch(SpiralSearch):
         self._slews_since_s = math.nan
         self._asked = Acquire()
         self._overlap: float | None = None
-        super().__init__(_STAR, loop.acquisition, self._plan_spiral, scale.motor_rad)
+        # What moved the light without a held beam turned the star by as much.
+        moves = loop.link is not None and rig.collector is not None
+        wanted = _STAR._replace(check=_CHECK_COLLECTOR) if moves else _STAR
+        super().__init__(wanted, loop.acquisition, self._plan_spiral, scale.motor_rad)
 
     def is_near(self, motor_rad: Floats, place_rad: Floats) -> bool:
         """Whether the siderostat, at `motor_rad`, is so near to a place that it has arrived there."""
@@ -83,17 +90,22 @@ class StarSearch(SpiralSearch):
         """Make the next search, and no other, as a command asks that was not refused."""
         self._asked = asked
 
+    @property
+    def asked_place_sky_arcsec(self) -> Floats | None:
+        """Where the next search is to begin, as a command asked; shape (2,)."""
+        az, el = self._asked.expected_az_sky_arcsec, self._asked.expected_el_sky_arcsec
+        return None if az is None or el is None else np.array([az, el])
+
     def start_where_expected(self, *, again: bool = False) -> None:
         """A new search, about where the star is expected now, or as a command asked.
 
         With `again`, the star was followed until now: it is searched for in rounds, if the rig file allows it.
         """
-        asked, self._asked = self._asked, Acquire()
+        place_sky_arcsec, asked, self._asked = self.asked_place_sky_arcsec, self._asked, Acquire()
         if self._attribution is not None:
             self._attribution.begin_search()
-        if asked.expected_az_sky_arcsec is not None and asked.expected_el_sky_arcsec is not None:
-            offset = np.array([asked.expected_az_sky_arcsec, asked.expected_el_sky_arcsec])
-            place_px = self._target_px + self._scale.sky_px(offset)
+        if place_sky_arcsec is not None:
+            place_px = self._target_px + self._scale.sky_px(place_sky_arcsec)
             self._estimator.place(place_px, self.sky_rad, np.zeros(2))
         self._overlap = asked.field_overlap
         # Two stars that were followed would lie on each other in the middle of the field.

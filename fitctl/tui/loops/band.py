@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from fitctl.messages.modes import HOLDING
+from fitctl.messages.modes import HOLDING, OPERATOR
 from fitctl.tui.draw import braille
 from fitctl.tui.inks import DIM, FAULT, GREEN, INK, ORANGE, PAPER, RED, SKY, WHITE
 from fitctl.tui.look import (
@@ -71,7 +71,7 @@ def why_safe(state: ConsoleState, loop: LoopView) -> str:
         return ""
     if has_failed(loop):
         return "fault"
-    by_command = loop.change is not None and loop.change.reason == "operator"
+    by_command = loop.change is not None and loop.change.reason == OPERATOR
     if not by_command:
         return "stopped"
     stopped_by = state.newest.stopped_by if state.newest else ""
