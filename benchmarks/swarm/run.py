@@ -61,6 +61,7 @@ from fitctl.messages.command_table import COMMANDS
 from fitctl.messages.commands import (
     Acquire,
     AnyCommand,
+    MoveCollector,
     Recover,
     Reply,
     SetTarget,
@@ -660,12 +661,17 @@ def _recover(instrument: Instrument) -> None:
     end_s = time.now_s() + HEAL_S
     # Where a star or a beam was never found, jogs and searches lead away; its operator knows where it is.
     from_zero_s = time.now_s() + HEAL_S / 3
+    # A collector that moved while its beam was not held moved the star by more than a search covers.
+    is_away = instrument.rig.collector is not None
     while time.now_s() < end_s:
         time.run_until(time.now_s() + 1.0)
         instrument.answers_due()
         loops = instrument.supervisor.loops
         if all(loop.mode in HOLDING for loop in loops.values()):
             break
+        if is_away and time.now_s() > from_zero_s:
+            instrument.give("ada", MoveCollector(action="reference"))
+            is_away = False
         instrument.lead_on("ada", from_zero=time.now_s() > from_zero_s)
     else:
         modes = ", ".join(f"{name} {loop.mode.name}" for name, loop in loops.items())

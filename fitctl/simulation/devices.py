@@ -230,7 +230,8 @@ class SimulatedHexapod:
         return _identity("hexapod")
 
     def reference(self, _is_wanted: Callable[[], bool] = lambda: True) -> None:
-        """It knows where it is, and takes no time to find out."""
+        """Begin to go to where all axes are at zero; the real one returns when it is there."""
+        self._go_to(Pose(), self._limits)
         self._referenced = True
 
     def move_to(self, pose: Pose, velocity_mm_s: float) -> None:
@@ -249,8 +250,7 @@ class SimulatedHexapod:
                     f"{axis} within {low:g} to {high:g}", f"{value:g}", "choose a nearer pose"
                 )
         velocity_mm_s = min(velocity_mm_s, self._limits.velocity_mm_s)
-        limits = self._limits._replace(velocity_mm_s=velocity_mm_s)
-        self._follow(plan_move(self._trajectory, self._clock.now_s(), pose, limits))
+        self._go_to(pose, self._limits._replace(velocity_mm_s=velocity_mm_s))
 
     def pose(self) -> HexapodReading:
         """Where it is."""
@@ -265,6 +265,9 @@ class SimulatedHexapod:
 
     def close(self) -> None:
         """A move that runs goes on."""
+
+    def _go_to(self, pose: Pose, limits: MotionLimits) -> None:
+        self._follow(plan_move(self._trajectory, self._clock.now_s(), pose, limits))
 
     def _follow(self, trajectory: Trajectory) -> None:
         self._plant.advance(self._clock.now_s())

@@ -42,6 +42,7 @@ from fitctl.messages.commands import (
     Experiment,
     Jog,
     Look,
+    MoveCollector,
     Off,
     RecorderReport,
     Recover,
@@ -454,6 +455,20 @@ def test_the_testbed_goes_back_to_its_stars_though_two_supervisors_are_killed_be
 
     assert result.violations == []
     assert result.modes["VERNIER"] >= 2
+
+
+@pytest.mark.long
+def test_the_testbed_finds_its_star_though_the_collector_went_far_without_a_held_beam():
+    result = run_plan(
+        plan(
+            gives(0.5, MoveCollector(action="reference")),
+            gives(8.0, MoveCollector(action="start", kind="drift", velocity_mm_s=1.0)),
+            duration_s=24.0,
+            rig="fit-testbed.toml",
+        )
+    )
+
+    assert result.violations == []
 
 
 POWER_CUT = plan(

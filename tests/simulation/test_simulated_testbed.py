@@ -150,6 +150,17 @@ def test_the_hexapod_goes_nowhere_before_it_is_referenced_or_beyond_its_travel()
         hexapod.move_to(Pose(y_mm=51.0), 8.0)
 
 
+def test_a_reference_move_leads_a_hexapod_back_to_zero(simulation):
+    simulation.hexapod.reference()
+    simulation.hexapod.move_to(Pose(y_mm=4.0), 8.0)
+    go_on(simulation, 2.0)
+    simulation.hexapod.reference()
+    assert simulation.hexapod.pose().moving
+    go_on(simulation, 2.0)
+    reading = simulation.hexapod.pose()
+    assert (reading.moving, reading.pose.y_mm) == (False, pytest.approx(0.0, abs=1e-9))
+
+
 def test_a_hexapod_that_is_stopped_brakes(simulation):
     simulation.hexapod.reference()
     simulation.hexapod.move_to(Pose(y_mm=40.0), 8.0)

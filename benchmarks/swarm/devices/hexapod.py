@@ -54,15 +54,20 @@ class SwarmHexapod(SimulatedHexapod):
 
     def reference(self, is_wanted: Callable[[], bool] = lambda: True) -> None:
         """Make a reference move, which takes seconds."""
-        self.line.ask(lambda: None)
-        ends_s = self._time.now_s() + _REFERENCE_S
-        while self._time.now_s() < ends_s:
+        self.line.ask(self._begin_reference)
+        began_s = self._time.now_s()
+        while self.moves or self._time.now_s() < began_s + _REFERENCE_S:
             self._time.sleep(0.1)
             self.line.ask(lambda: None)
-            if not is_wanted():
+            if not is_wanted() or self._servos_off():
                 self.stop()
                 raise self._refusal("all axes referenced", "a stop", "reference it again")
-        super().reference()
+        self._referenced = True
+
+    def _begin_reference(self) -> None:
+        if "stuck" not in self.line.wrong:
+            super().reference()
+        self._referenced = False
 
     def move_to(self, pose: Pose, velocity_mm_s: float) -> None:
         """Start a move."""
