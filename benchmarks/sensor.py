@@ -2,7 +2,7 @@
 
 The frames are those of a held star: anywhere within 0.3 px of the middle of a pixel. A bad pixel is known from
 the dark frame, a hot one is not; both are in the star's window. A spot that is wider than the rig file has it
-has several pixels that look hot.
+has several pixels that look hot. An own spot, which the rig file has, reaches into the window.
 """
 
 from __future__ import annotations
@@ -23,6 +23,15 @@ LOOP = "right"
 WIDER = 1.13
 FRAMES = 64
 BAD_PX, HOT = (18, 21), HotPixel(az_px=22, el_px=19, dn=3000.0)  # row and column
+OWN_PX, OWN_DN = (4.0, 0.0), 3000.0
+OWN = f'{{name="near", offset_px={{az={OWN_PX[0]}, el={OWN_PX[1]}}}, flux_dn={OWN_DN}}}'
+CASES = (
+    "",
+    "a bad pixel in the window",
+    "a hot pixel in the window",
+    "a wider spot",
+    "an own spot 4 px away",
+)
 STAR_PX = np.array([20.0, 20.0])
 SPREAD_PX = 0.3
 
@@ -31,9 +40,11 @@ def sensors_and_frames(folder: Path) -> dict[str, tuple[StarSensor, list[np.ndar
     """By case: who measures, and what."""
     cases = {}
     for sensor in ("centroid", "fit"):
-        for case in ("", "a bad pixel in the window", "a hot pixel in the window", "a wider spot"):
+        for case in CASES:
             bad, hot = "bad" in case, "hot" in case
             settings = [f"loops.{LOOP}.sensor={sensor}"]
+            if "own" in case:
+                settings.append(f"loops.{LOOP}.other_spots=[{OWN}]")
             if "wider" in case:
                 settings.append(f"loops.{LOOP}.spot_diameter_px={3.0 / WIDER}")
             rig = load_rig(default_rig_path(), settings)
@@ -44,12 +55,18 @@ def sensors_and_frames(folder: Path) -> dict[str, tuple[StarSensor, list[np.ndar
                 settings.append(f"camera.dark_file={folder / 'dark.npy'}")
                 rig = load_rig(default_rig_path(), settings)
             truth, _ = rig.mock_parts()
-            spots = truth.stellar_loops[LOOP].spots[:1]
+            spots, places_px = list(truth.stellar_loops[LOOP].spots[:1]), [(0.0, 0.0)]
+            if "own" in case:
+                spots.append(spots[0].model_copy(update={"flux_dn": OWN_DN}))
+                places_px.append(OWN_PX)
             scene = Scene(rig.camera, spots, [HOT] if hot else [])
             away_px = np.random.default_rng(1).uniform(-SPREAD_PX, SPREAD_PX, (FRAMES, 2))
             cases[f"{sensor}, {case}" if case else sensor] = (
                 StarSensor(rig.camera, rig.stellar_loops[LOOP]),
-                [scene.frame(STAR_PX + one[None], 1, n) for n, one in enumerate(away_px)],
+                [
+                    scene.frame(STAR_PX + one + np.array(places_px), 1, n)
+                    for n, one in enumerate(away_px)
+                ],
             )
     return cases
 

@@ -99,7 +99,8 @@ class StarSensor:
     other_light : list of OtherLight
         Spots of other loops. Their light is subtracted from a window, or it would pull this loop's star.
     near_spots : list of OtherSpot
-        The loop's own other spots, where their light reaches into the star's window: a fit subtracts it.
+        The loop's own other spots, where their light reaches into the star's window: it is subtracted before a
+        fit, with the star where it is expected.
     """
 
     def __init__(self, camera: Camera, loop: Loop) -> None:
@@ -210,12 +211,12 @@ class StarSensor:
             return Star(az + az_px, el + el_px, flux_dn, az, el, sigma_px, sigma_px)
         top, left = el - HALF_WINDOW_PX, az - HALF_WINDOW_PX
         without = self._dark.without_measurement(image, top, left, side, side)
+        if self.near_spots:
+            # Of a star of 1 DN: the window has its light and theirs.
+            near = moving_with_star(self._loop, self.near_spots, window_az_px, window_el_px, 1.0)
+            near_dn = np.sum([spot_light(spot, az, el) for spot in near], axis=0)
+            light_dn -= flux_dn / (1.0 + near_dn.sum()) * near_dn
         place = self.fit.place(light_dn, az_px, el_px, without)
-        if place is not None and self.near_spots:
-            star = (az + place.az_px, el + place.el_px, place.flux_dn)
-            for spot in moving_with_star(self._loop, self.near_spots, *star):
-                light_dn -= spot_light(spot, az, el)
-            place = self.fit.place(light_dn, place.az_px, place.el_px, without)
         if place is None:
             return None
         az_px, el_px, _, az_sigma_px, el_sigma_px = place

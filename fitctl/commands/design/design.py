@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -24,7 +25,7 @@ from fitctl.commands.shared.printing import say_lines, to_json
 from fitctl.commands.shared.rig import require_loop, rig_of
 from fitctl.config import ConfigError, Rig
 from fitctl.controllers.design import coarse, lqg_ltr
-from fitctl.controllers.design.basis import Basis, basis, night_of
+from fitctl.controllers.design.basis import Basis, Line, basis, night_of
 from fitctl.controllers.design.choose import DESIGNS, design_for, solving
 from fitctl.controllers.design.deadzone import DeadzoneResult, deadzone_result
 from fitctl.controllers.design.draw import draw_loop_shapes, save_figure
@@ -40,6 +41,8 @@ from fitctl.model.optics import scales
 
 _RECOVERY_WEIGHTS = (1e-5, 1e-6, 1e-7, 1e-8, 0.5e-9, 1e-11)
 _COARSE_GAINS_HZ = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0)
+_SINE = 1e-4  # damping of a line that has none: a design can then follow it as well
+_ACROSS = 1e-6  # a line across an axis has no more of its RMS along it
 _MARGIN_AMPLITUDES = (1.05, 1.2, 2.0, 10.0)
 
 Report = tuple[dict[str, Any], list[str]]
@@ -276,7 +279,34 @@ def _bound(rig: Rig, loop: str) -> Report:
         " the mirror held between commands",
         f"  at the frame instants alone: {found.frame_residual_px:.4f} px",
     ]
-    return found._asdict() | {"rate_hz": rate_hz, "delay_s": its_basis.delay_s}, lines
+    result = found._asdict() | {"rate_hz": rate_hz, "delay_s": its_basis.delay_s}
+    plant_px = _plant_bound_px(rig, loop, its_basis)
+    if plant_px is not None:
+        lines.append(
+            f"  with the air path and the lines of plant.loops.{loop}, worst axis: {plant_px:.4f} px"
+        )
+    return result | {"plant_residual_px": plant_px}, lines
+
+
+def _plant_bound_px(rig: Rig, loop: str, its_basis: Basis) -> float | None:
+    """With the air path and the lines of the rig file's plant; None if the loop's model has the same."""
+    plant = None if rig.plant is None else rig.plant.stellar_loops[loop]
+    if plant is None:
+        return None
+    true_air = {name: getattr(plant.air_path, name) for name in ("gain_px", "b1_s2", "b2_s")}
+    air = its_basis.air_path.model_copy(update=true_air)
+    if air == its_basis.air_path and not plant.lines:
+        return None
+    residuals_px = []
+    for along in (math.cos, math.sin):
+        shaken = tuple(
+            Line(each.frequency_hz, max(each.damping, _SINE), each.rms_px * part)
+            for each in plant.lines
+            if (part := abs(along(math.radians(each.direction_deg)))) > _ACROSS
+        )
+        night = dataclasses.replace(its_basis, air_path=air, lines=shaken)
+        residuals_px.append(bound(night).residual_px)
+    return max(residuals_px)
 
 
 def _one(name: str) -> Callable[[Rig, str], Report]:

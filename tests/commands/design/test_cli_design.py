@@ -79,6 +79,26 @@ def test_the_bound_of_any_rig(design):
     assert flight["residual_px"] < 0.004
 
 
+@pytest.mark.parametrize(
+    ("night", "residual_px"),
+    [
+        ("air_path.b1_s2=0.1", 0.0250),
+        (
+            "lines=[{frequency_hz=6.0, rms_px=0.05, direction_deg=90.0, damping=0.005, drift_hz_per_min=0.0}]",
+            0.0245,
+        ),
+    ],
+)
+def test_the_bound_of_the_plants_night(design, night, residual_px):
+    night = f"plant.loops.right.{night}"
+    found = json.loads(design("bound", "--json", "--set", night)[1])
+    assert found["residual_px"] == pytest.approx(0.0130, abs=5e-5)
+    assert found["plant_residual_px"] == pytest.approx(residual_px, abs=5e-5)
+    assert (
+        f"plant.loops.right, worst axis: {residual_px:.4f} px" in design("bound", "--set", night)[1]
+    )
+
+
 @pytest.mark.long
 def test_the_coarse_loop_and_what_its_play_does(design):
     found = json.loads(design("coarse", "--json")[1])
