@@ -11,15 +11,19 @@ from fitctl.commissioning.outcome import BEFORE, Outcome, Site, StepError
 from fitctl.commissioning.steps import stacks
 from fitctl.commissioning.steps.camera import streaming
 from fitctl.commissioning.steps.plate import (
+    EVEN,
     LEAST_PX,
     ROTATION_APART_DEG,
     SCALE_APART,
     Floats,
+    gains_of,
     similar,
+    turned_further,
+    uneven_line,
 )
 from fitctl.commissioning.steps.sky import Watch, displaced
 from fitctl.controllers.mirror import Mirror
-from fitctl.model.optics import scales
+from fitctl.model.optics import scales, stage_turn
 
 STACK_V = 2.5
 _SWINGS = 3
@@ -163,18 +167,21 @@ def _mirror_outcome(site: Site, seen: Floats, expected: Floats, furthest_v: floa
         for device in ("dac", "piezo"):
             old = getattr(fsm, device).channels or [1, 2, 3]
             found[device] = {"channels": [old[order.index(stack)] for stack in range(3)]}
+    turned_deg = fsm.rotation_deg
     if abs(now.rotation_deg) > ROTATION_APART_DEG:
-        whole_deg = fsm.rotation_deg + now.rotation_deg
-        found["rotation_deg"] = round((whole_deg + 180) % 360 - 180, 1)
-    if abs(now.scale - 1) > 2 * SCALE_APART:
-        if common := _common_scale(site, now.scale):
-            lines.append(
-                "the siderostat's scale differs by the same factor: the focal length is assumed to be the "
-                "cause of both, and the gear stays as in the rig file"
-            )
-            return Outcome(lines, figures, common)
-        gains = now.scale * (np.eye(2) if fsm.axis_gains is None else np.array(fsm.axis_gains))
-        found["axis_gains"] = [[round(float(one), 3) for one in row] for row in gains]
+        turned_deg = found["rotation_deg"] = turned_further(turned_deg, now.rotation_deg)
+    scaled = abs(now.scale - 1) > 2 * SCALE_APART
+    if scaled and (common := _common_scale(site, now.scale)):
+        lines.append(
+            "the siderostat's scale differs by the same factor: the focal length is assumed to be the "
+            "cause of both, and the gear stays as in the rig file"
+        )
+        return Outcome(lines, figures, common)
+    if now.uneven > EVEN:
+        lines.append(uneven_line(now))
+    if scaled or now.uneven > EVEN:
+        whole = matrix @ stage_turn(fsm.rotation_deg, fsm.axis_gains)
+        found["axis_gains"] = gains_of(whole, turned_deg)
     return Outcome(lines, figures, site.found(fsm=found) if found else {})
 
 

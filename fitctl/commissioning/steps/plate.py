@@ -26,7 +26,7 @@ _NEAR_PX = 3.0
 APART_PX = 7.0  # of two stars, to be told apart on the way
 SCALE_APART = 0.08
 ROTATION_APART_DEG = 5.0
-_EVEN = 1.15  # of the two singular values
+EVEN = 1.15  # of the two singular values
 _TWIN = 0.8  # of the brightest spot's light
 _FLIPS = {
     "azimuth reversed": np.diag([-1.0, 1.0]),
@@ -52,6 +52,24 @@ def similar(matrix: Floats) -> Similar:
         math.sqrt(abs(float(np.linalg.det(matrix)))),
         math.degrees(math.atan2(c - b, a + d)),
         float(largest / max(least, 1e-12)),
+    )
+
+
+def turned_further(rotation_deg: float, by_deg: float) -> float:
+    """The rig file's `rotation_deg`, corrected by a measured difference."""
+    return round((rotation_deg + by_deg + 180) % 360 - 180, 1)
+
+
+def gains_of(matrix: Floats, rotation_deg: float) -> list[list[float]]:
+    """The `axis_gains`, row by row, that multiply with a stage's rotation to the matrix, shape (2, 2)."""
+    gains = rotation(rotation_deg).T @ matrix
+    return [[round(float(one), 3) + 0.0 for one in row] for row in gains]  # 0.0, not -0.0
+
+
+def uneven_line(off: Similar) -> str:
+    """How the gains of a stage's axes differ from the expected ones, of which its response is off by `off`."""
+    return (
+        f"the ratio of the axes' gains differs from the rig file's by a factor of {off.uneven:.2f}"
     )
 
 
@@ -283,8 +301,8 @@ def _siderostat_outcome(site: Site, seen: Floats, furthest_rad: float) -> Outcom
             _FLIPS.items(), key=lambda one: round(abs(similar(seen @ one[1]).rotation_deg) / 45)
         )
     hand = seen @ flip
-    now, was = similar(hand), similar(expected)
-    relative = now.scale / was.scale
+    now, off = similar(hand), similar(hand @ np.linalg.inv(expected))
+    relative = off.scale
     figures = {
         "scale": now.scale,
         "scale_over_expected": relative,
@@ -300,13 +318,12 @@ def _siderostat_outcome(site: Site, seen: Floats, furthest_rad: float) -> Outcom
     found: dict[str, Any] = {}
     if flip_name:
         found["wiring"] = _flipped(site, flip)
-    apart_deg = (now.rotation_deg - was.rotation_deg + 180) % 360 - 180
-    if abs(apart_deg) > ROTATION_APART_DEG:
-        found["rotation_deg"] = round(now.rotation_deg, 1)
-    turned = found.get("rotation_deg", loop.siderostat.rotation_deg)
-    if now.uneven > _EVEN * was.uneven:
-        gains = rotation(turned).T @ hand
-        found["axis_gains"] = [[round(float(one), 3) for one in row] for row in gains]
+    turned_deg = loop.siderostat.rotation_deg
+    if abs(off.rotation_deg) > ROTATION_APART_DEG:
+        turned_deg = found["rotation_deg"] = turned_further(turned_deg, off.rotation_deg)
+    if off.uneven > EVEN:
+        found["axis_gains"] = gains_of(hand, turned_deg)
+        lines.append(uneven_line(off))
     elif abs(relative - 1) > SCALE_APART:
         found["spur_gear_ratio"] = round(loop.siderostat.spur_gear_ratio / relative, 2)
         if relative < 1:  # the motors' own travel stays as it was

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from commissioning.motor_bench import RIG, BenchAmplifiers, site_of
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from fitctl.clock import VirtualClock
@@ -68,6 +68,103 @@ def test_axes_of_different_gains_become_axis_gains():
     said = found(_siderostat_outcome(site_of(), seen, 0.0), "siderostat")
     again = rotation(said["rotation_deg"]) @ np.array(said["axis_gains"])
     assert again == pytest.approx(seen, abs=0.01)
+
+
+def rig_with(stage, **keys):
+    """The default rig with other keys of one of its stages; those that are None are left out."""
+    overrides = [
+        f"loops.right.{stage}.{key}={value}" for key, value in keys.items() if value is not None
+    ]
+    return load_rig(default_rig_path(), overrides)
+
+
+def corrected(rig, stage, said):
+    """The rig with what a step found of a stage laid over."""
+    loop = rig.loops["right"]
+    settings = getattr(loop, stage).model_copy(update=said)
+    return rig.model_copy(update={"loops": {"right": loop.model_copy(update={stage: settings})}})
+
+
+def px_per_rad(rig):
+    """How far the motors move the star by the rig file, without rotation and gains."""
+    return scales(rig, rig.loops["right"]).motor_px_per_rad
+
+
+@st.composite
+def gains(draw, least, most, across):
+    (a, d), (b, c) = (
+        [draw(st.floats(*ends)) for _ in "ab"] for ends in ((least, most), (-across, across))
+    )
+    return [[a, b], [c, d]]
+
+
+@pytest.mark.parametrize("seen", [np.eye(2), np.diag([0.77, 1.3])])
+def test_wrong_gains_in_the_rig_file_are_found_also_if_they_are_as_uneven_as_the_true_ones(seen):
+    rig = rig_with("siderostat", axis_gains=[[1.3, 0.0], [0.0, 0.77]])
+
+    outcome = _siderostat_outcome(site_of(rig), seen, 0.0)
+
+    assert found(outcome, "siderostat") == {"axis_gains": seen.tolist()}
+    assert "the ratio of the axes' gains differs from the rig file's" in outcome.lines[-1]
+
+
+@settings(deadline=None)
+@given(st.none() | gains(0.75, 1.35, 0.1), degrees, gains(0.75, 1.35, 0.1), degrees)
+def test_with_what_is_found_the_siderostat_of_any_rig_file_has_the_measured_response(
+    rig_gains, rig_deg, true_gains, true_deg
+):
+    rig = rig_with("siderostat", rotation_deg=rig_deg, axis_gains=rig_gains)
+    seen = rotation(true_deg) @ np.array(true_gains)
+
+    said = found(_siderostat_outcome(site_of(rig), seen, 0.0), "siderostat")
+
+    again = corrected(rig, "siderostat", said)
+    over = px_per_rad(rig) / px_per_rad(again)
+    model = scales(again, again.loops["right"]).siderostat_turn
+    off = seen * over @ np.linalg.inv(model)
+    if "axis_gains" in said:
+        assert off == pytest.approx(np.eye(2), abs=0.005)
+    parts = similar(off)
+    assert abs(parts.rotation_deg) <= 5.06
+    assert parts.scale == pytest.approx(1.0, abs=0.081)
+    assert parts.uneven <= 1.151
+    repeated = _siderostat_outcome(site_of(again), seen * over, 0.0)
+    assert found(repeated, "siderostat") == {}
+
+
+@settings(deadline=None)
+@given(
+    st.none() | gains(0.85, 1.2, 0.08), degrees, gains(0.85, 1.2, 0.08), st.floats(-30.0, 30.0),
+    st.floats(0.6, 1.5),
+)  # fmt: skip
+def test_with_what_is_found_the_mirror_of_any_rig_file_has_the_measured_response(
+    rig_gains, rig_deg, true_gains, by_deg, size
+):
+    rig = rig_with("fsm", rotation_deg=rig_deg, axis_gains=rig_gains)
+    expected = scales(rig, rig.loops["right"]).mirror_turn
+    truth = size * rotation(rig_deg + by_deg) @ np.array(true_gains)
+
+    outcome = _mirror_outcome(site_of(rig), STRAIGHT @ truth.T, STRAIGHT @ expected.T, 0.0)
+
+    said = found(outcome, "fsm")
+    assert "dac" not in said
+    again = corrected(rig, "fsm", said)
+    off = truth @ np.linalg.inv(scales(again, again.loops["right"]).mirror_turn)
+    if "axis_gains" in said:
+        assert off == pytest.approx(np.eye(2), abs=0.005)
+    parts = similar(off)
+    assert abs(parts.rotation_deg) <= 5.06
+    assert parts.scale == pytest.approx(1.0, abs=0.161)
+    assert parts.uneven <= 1.151
+
+
+def test_axes_of_a_mirror_that_are_even_replace_the_gains_of_the_rig_file():
+    uneven = np.diag([1.3, 0.77])
+    rig = rig_with("fsm", axis_gains=uneven.tolist())
+
+    outcome = _mirror_outcome(site_of(rig), STRAIGHT, STRAIGHT @ uneven, 0.0)
+
+    assert found(outcome, "fsm") == {"axis_gains": [[1.0, 0.0], [0.0, 1.0]]}
 
 
 def test_exchanged_axes_keep_the_signs_that_were_found_before():
