@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from fitctl.config import Rig
+from fitctl.controllers.centroid import sensor_noise_px
 from fitctl.figures.plate import Comparison, Plate, save
 from fitctl.identify.air_fit import fit_air_path
 from fitctl.identify.airpath import (
@@ -18,7 +19,6 @@ from fitctl.identify.airpath import (
 from fitctl.identify.frames import frames_of_records, track_spots
 from fitctl.identify.run import on_simulation
 from fitctl.learn.intervals import Interval
-from fitctl.model.image.light import centroid_noise_px
 from fitctl.model.plant import Plant
 
 _PAPER_GAIN_PX, _PAPER_B1_S2, _PAPER_B2_S, _PAPER_NOISE_PX = 0.45, 0.517, 2.5, 0.01  # Eq. 9
@@ -38,7 +38,8 @@ def figure_7(rig: Rig, loop_name: str, seed: int, folder: Path, minutes: int) ->
     found = analyse(rig, loop_name, tracks)
     truth, _ = rig.mock_parts()
     air = truth.stellar_loops[loop_name].air_path
-    noise_px = centroid_noise_px(rig.camera, truth.stellar_loops[loop_name].spots[0].flux_dn, 7)
+    flux_dn = truth.stellar_loops[loop_name].spots[0].flux_dn
+    noise_px = sensor_noise_px(rig.camera, rig.stellar_loops[loop_name], flux_dn)
     fit = found.joint
     rows = [
         _row("k, px", _PAPER_GAIN_PX, fit.gain_px, air.gain_px),
@@ -76,7 +77,8 @@ def coverage(rig: Rig, loop_name: str, seed: int, minutes: int) -> float:
     """Part of the 95 % intervals that hold the plant's parameters, both axes fitted together."""
     truth, _ = rig.mock_parts()
     air, period_s = truth.stellar_loops[loop_name].air_path, rig.camera.period_s
-    noise_px = centroid_noise_px(rig.camera, rig.stellar_loops[loop_name].star_flux_dn, 7)
+    loop = rig.stellar_loops[loop_name]
+    noise_px = sensor_noise_px(rig.camera, loop, loop.star_flux_dn)
     held = 0
     for number in range(1, minutes + 1):
         whole = Plant(rig, [seed + number], history_s=RECOMMENDED_S + 1.0)
@@ -85,9 +87,7 @@ def coverage(rig: Rig, loop_name: str, seed: int, minutes: int) -> float:
         frame_s = np.arange(1, round(RECOMMENDED_S / period_s)) * period_s
         star_px = np.array([plant.spots_px(time_s)[0, 0] for time_s in frame_s])
         star_px += noise_px * np.random.default_rng(seed + number).standard_normal(star_px.shape)
-        fit = fit_air_path(
-            star_px - star_px.mean(axis=0), period_s, rig.stellar_loops[loop_name].vernier.air_path
-        )
+        fit = fit_air_path(star_px - star_px.mean(axis=0), period_s, loop.vernier.air_path)
         held += fit.gain_px.covers(air.gain_px) + fit.b1_s2.covers(air.b1_s2)
         held += fit.b2_s.covers(air.b2_s)
     return held / (3 * minutes)

@@ -1,7 +1,8 @@
 """The width of a loop's spot, from frames: the template of ``sensor = "fit"``.
 
 Every frame gives the spot's light, place and background by least squares, and all frames together its width. A
-spot that a moving star smears has the width that the sensor will see.
+spot that a moving star smears has the width that the sensor will see. The loop's other spots are part of the
+model: they move with the star, and have its width. Bad and saturated pixels do not count.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +35,8 @@ MOST_FRAMES = 3000
 NOT_ROUND = 2.0
 """A round Gaussian leaves the pixels' noise; more than so many times that is another shape."""
 _SIDE = 2 * HALF_WINDOW_PX + 1
+_LEAST_PIXELS = _SIDE**2 // 2 + 1  # of a window, that are neither bad nor saturated
+_AMOUNTS = 5  # of a frame: flux, two coordinates, width, background
 _NARROWEST_PX, _WIDEST_PX = 1.0, 8.0
 _STEPS, _ENOUGH_PX = 30, 1e-5
 _SLOPE_PX = 1e-3  # for derivatives
@@ -56,7 +59,8 @@ class SpotResult:
     excess : float
         RMS of what the fit leaves, over the pixels' noise.
     distance_px, light : arrays, shape (pixels,)
-        Of pixels from the spot's centre, and their light as a part of the spot's.
+        Of the pixels that count: distance from the spot's centre, and light as a part of the spot's. The light
+        of other spots is subtracted.
     """
 
     loop: str
@@ -127,8 +131,9 @@ def analyse(rig: Rig, loop_name: str, frames: Iterable[TimedImage]) -> SpotResul
         If there are too few of them, or it is as narrow as a pixel or as wide as the window.
     """
     camera, loop = rig.camera, rig.stellar_loops[loop_name]
-    light_dn = _windows(frames, camera, loop)
-    diameter_px, each_px, places, left_dn = _fit(light_dn, loop.spot_diameter_px)
+    windows = _windows(frames, camera, loop)
+    spots = _Spots.of(loop)
+    diameter_px, each_px, places, left_dn = _fit(windows, spots, loop.spot_diameter_px)
     if not _NARROWEST_PX < diameter_px < _WIDEST_PX:
         msg = (
             f"the spot's diameter comes out at {diameter_px:.2f} px; expected {_NARROWEST_PX:g} to "
@@ -136,49 +141,110 @@ def analyse(rig: Rig, loop_name: str, frames: Iterable[TimedImage]) -> SpotResul
         )
         raise IdentifyError(msg)
     flux_dn, az_px, el_px, background_dn = places.T
-    shape = gaussian_shape(diameter_px, az_px, el_px)
+    shape = spots.shape(diameter_px, az_px, el_px)
     photon_dn = 1 / (camera.electrons_per_dn or math.inf)
     light = np.maximum(flux_dn[:, None] * shape, 0.0)
     expected_dn2 = camera.pixel_noise_dn**2 + photon_dn * light
+    freedom = np.count_nonzero(windows.counts) - _AMOUNTS * len(flux_dn)
     centres = np.arange(_SIDE) - HALF_WINDOW_PX
     el_at, az_at = np.meshgrid(centres, centres, indexing="ij")
-    few = slice(None, None, max(1, len(light_dn) // 100))
+    few = slice(None, None, max(1, len(flux_dn) // 100))
+    counts = windows.counts[few]
     distance_px = np.hypot(az_at.ravel() - az_px[few, None], el_at.ravel() - el_px[few, None])
+    part = (windows.light_dn[few] - background_dn[few, None]) / flux_dn[few, None]
+    others = shape[few] - gaussian_shape(diameter_px, az_px[few], el_px[few])
     return SpotResult(
         loop=loop_name,
         diameter_px=diameter_px,
         diameter_sd_px=float(each_px.std(ddof=1)) / math.sqrt(len(each_px)),
         rig_diameter_px=loop.spot_diameter_px,
-        frames=len(light_dn),
+        frames=len(flux_dn),
         flux_dn=float(np.median(flux_dn)),
-        excess=float(np.sqrt(np.mean(left_dn**2 / expected_dn2) * _SIDE**2 / (_SIDE**2 - 5))),
-        distance_px=distance_px.ravel(),
-        light=((light_dn[few] - background_dn[few, None]) / flux_dn[few, None]).ravel(),
+        excess=math.sqrt(float(np.sum(left_dn**2 / expected_dn2)) / freedom),
+        distance_px=distance_px[counts],
+        light=(part - others)[counts],
     )
 
 
-def _windows(frames: Iterable[TimedImage], camera: Camera, loop: Loop) -> Floats:
-    """Light about the loop's star, shape (frames, 49), less what pixels read without any."""
+class _Windows(NamedTuple):
+    """Pixels about the loop's star.
+
+    Attributes
+    ----------
+    light_dn : array, shape (frames, 49)
+        Less what pixels read without any.
+    counts : array of bool, shape (frames, 49)
+        False for pixels that are bad or saturated.
+    """
+
+    light_dn: Floats
+    counts: NDArray[np.bool_]
+
+
+def _windows(frames: Iterable[TimedImage], camera: Camera, loop: Loop) -> _Windows:
     sensor, dark = StarSensor(camera, loop), Dark(camera)
-    kept: list[Floats] = []
+    lights_dn: list[Floats] = []
+    counts: list[NDArray[np.bool_]] = []
+    spoilt = 0
     for _, image in frames:
         star = sensor.find(image)
         if star is None:
             continue
         el, az = star.window_el_px - HALF_WINDOW_PX, star.window_az_px - HALF_WINDOW_PX
-        kept.append(dark.light(image, el, az, _SIDE, _SIDE).ravel().copy())
-        if len(kept) == MOST_FRAMES:
+        good = np.ones(_SIDE**2, dtype=bool)
+        good[list(dark.without_measurement(image, el, az, _SIDE, _SIDE))] = False
+        if np.count_nonzero(good) < _LEAST_PIXELS:
+            spoilt += 1
+            continue
+        lights_dn.append(dark.light(image, el, az, _SIDE, _SIDE).ravel().copy())
+        counts.append(good)
+        if len(counts) == MOST_FRAMES:
             break
-    if len(kept) < LEAST_FRAMES:
+    if len(counts) < LEAST_FRAMES:
+        more = f"; on {spoilt} more, half of its pixels are bad or saturated" if spoilt else ""
         msg = (
-            f"{len(kept)} frames show the star; expected at least {LEAST_FRAMES}; hold the star and record "
-            "again"
+            f"{len(counts)} frames show the star{more}; expected at least {LEAST_FRAMES}; hold the star and "
+            "record again"
         )
         raise IdentifyError(msg)
-    return np.array(kept)
+    return _Windows(np.array(lights_dn), np.array(counts))
 
 
-def _fit(light_dn: Floats, diameter_px: float) -> tuple[float, Floats, Floats, Floats]:
+class _Spots(NamedTuple):
+    """The loop's star and its other spots, which move with it.
+
+    Attributes
+    ----------
+    offsets_px : array, shape (spots, 2)
+        From the star, azimuth and elevation.
+    parts : array, shape (spots,)
+        Light, as a part of the star's.
+    """
+
+    offsets_px: Floats
+    parts: Floats
+
+    @classmethod
+    def of(cls, loop: Loop) -> _Spots:
+        """From the rig file."""
+        spots = loop.other_spots
+        return cls(
+            np.array([(0.0, 0.0), *((one.offset_px.az, one.offset_px.el) for one in spots)]),
+            np.array([1.0, *(one.flux_dn / loop.star_flux_dn for one in spots)]),
+        )
+
+    def shape(self, diameter_px: float, az_px: Floats, el_px: Floats) -> Floats:
+        """:func:`gaussian_shape` of all spots together, as a part of the star's light."""
+        az_offsets_px, el_offsets_px = self.offsets_px.T
+        each = gaussian_shape(
+            diameter_px, az_px[..., None] + az_offsets_px, el_px[..., None] + el_offsets_px
+        )
+        return np.asarray(self.parts @ each)
+
+
+def _fit(
+    windows: _Windows, spots: _Spots, diameter_px: float
+) -> tuple[float, Floats, Floats, Floats]:
     """The width that suits all frames, by Gauss and Newton.
 
     Returns
@@ -189,8 +255,9 @@ def _fit(light_dn: Floats, diameter_px: float) -> tuple[float, Floats, Floats, F
     places : array, shape (frames, 4)
         Flux, place on both axes, background.
     left_dn : array, shape (frames, 49)
-        What the fit leaves.
+        What the fit leaves; 0 where a pixel does not count.
     """
+    light_dn, counts = windows
     # From a centre of gravity.
     centres = np.arange(_SIDE) - float(HALF_WINDOW_PX)
     el_at, az_at = (one.ravel() for one in np.meshgrid(centres, centres, indexing="ij"))
@@ -200,17 +267,18 @@ def _fit(light_dn: Floats, diameter_px: float) -> tuple[float, Floats, Floats, F
     )
     for _ in range(_STEPS):
         flux_dn, az_px, el_px, background_dn = values.T
-        shape = gaussian_shape(diameter_px, az_px, el_px)
+        shape = spots.shape(diameter_px, az_px, el_px)
 
         terms = np.stack(
             [
                 shape,
-                *(flux_dn[:, None] * slope for slope in _slopes(diameter_px, az_px, el_px)),
+                *(flux_dn[:, None] * slope for slope in _slopes(spots, diameter_px, az_px, el_px)),
                 np.ones_like(shape),
             ],
             axis=-1,
         )
-        left_dn = light_dn - flux_dn[:, None] * shape - background_dn[:, None]
+        terms *= counts[..., None]
+        left_dn = counts * (light_dn - flux_dn[:, None] * shape - background_dn[:, None])
         turned = terms.swapaxes(1, 2)
         steps = np.linalg.solve(turned @ terms, turned @ left_dn[..., None])[..., 0]
         each_px = diameter_px + steps[:, 3]
@@ -222,14 +290,12 @@ def _fit(light_dn: Floats, diameter_px: float) -> tuple[float, Floats, Floats, F
     return float(np.mean(each_px)), each_px, values, left_dn
 
 
-def _slopes(diameter_px: float, az_px: Floats, el_px: Floats) -> list[Floats]:
-    """Of a spot's shape by its place on both axes and by its width, each shape (frames, 49)."""
+def _slopes(spots: _Spots, diameter_px: float, az_px: Floats, el_px: Floats) -> list[Floats]:
+    """Of the spots' shape by the star's place on both axes and by the width, each shape (frames, 49)."""
     at = np.array([np.full_like(az_px, diameter_px), az_px, el_px])
     slopes = []
     for by in (1, 2, 0):
         step = _SLOPE_PX * np.eye(3)[by][:, None]
-        ahead, behind = (
-            gaussian_shape(one[0, 0], one[1], one[2]) for one in (at + step, at - step)
-        )
+        ahead, behind = (spots.shape(one[0, 0], one[1], one[2]) for one in (at + step, at - step))
         slopes.append((ahead - behind) / (2 * _SLOPE_PX))
     return slopes

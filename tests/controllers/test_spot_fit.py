@@ -74,6 +74,19 @@ def test_with_photon_noise_it_reaches_that_bound_too(flux_dn):
     assert fit.noise_px(flux_dn) == pytest.approx(bound_px, rel=0.03)
 
 
+@pytest.mark.parametrize(
+    ("diameter_px", "within"), [(2.0, 0.07), (1.5, 0.1), (1.2, 0.15), (1.0, 0.25)]
+)
+def test_the_noise_of_a_narrow_spot_includes_the_error_between_nodes(diameter_px, within):
+    fit = SpotFit(diameter_px, NOISE_DN, FLUX_DN)
+    found, _ = errors(fit, diameter_px=diameter_px)
+    assert fit.noise_px(FLUX_DN) == pytest.approx(np.sqrt(np.mean(found**2)), rel=within)
+
+
+def test_from_3_px_on_the_noise_is_that_of_the_pixels_alone():
+    assert FIT.noise_px(2 * FLUX_DN) == FIT.noise_px(FLUX_DN) / 2
+
+
 def test_a_spot_that_is_13_percent_wider_than_told_is_found_within_0_006_px():
     found, _ = errors(FIT, diameter_px=1.13 * DIAMETER_PX)
     assert found.std() <= 0.006

@@ -4,10 +4,10 @@ import math
 
 import numpy as np
 
+from fitctl.controllers.centroid import sensor_noise_px
 from fitctl.controllers.position_servo import PositionServo
 from fitctl.identify.record import ExperimentRecord
 from fitctl.model.drives import FSM, SIDEROSTAT, STACKS, channel_values, experiment_s
-from fitctl.model.image.light import centroid_noise_px
 from fitctl.model.optics import scales, stack_volts
 from fitctl.model.plant import Plant
 
@@ -34,7 +34,7 @@ def record_of(rig, loop, drives, seed=0, extra_s=0.5, frame_delay_s=None, plant=
         camera.period_s,
         rad_per_count,
     )
-    noise_px = centroid_noise_px(camera, settings.star_flux_dn, 7)
+    noise_px = sensor_noise_px(camera, settings, settings.star_flux_dn)
     delay_s = camera.frame_delay_s if frame_delay_s is None else frame_delay_s
 
     def encoders_rad():

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from fitctl.config import default_rig_path, load_rig, rig_from_document
+from fitctl.controllers.centroid import sensor_noise_px
 from fitctl.identify import delay
 from fitctl.identify.errors import IdentifyError
 from fitctl.identify.record import ExperimentRecord
 from fitctl.model.drives import FSM, channel_values, experiment_s
-from fitctl.model.image.light import centroid_noise_px
 from fitctl.model.optics import scales, stack_volts
 from fitctl.model.plant import Plant
 
@@ -45,9 +45,8 @@ def swings(rig, seed=0, stamp_error_s=0.0, delay_s=0.035, exposure_s=0.0, drives
             for time_s in exposed_s
         ]
     )
-    star_px += centroid_noise_px(rig.camera, loop.star_flux_dn, 7) * random.standard_normal(
-        star_px.shape
-    )
+    noise_px = sensor_noise_px(rig.camera, loop, loop.star_flux_dn)
+    star_px += noise_px * random.standard_normal(star_px.shape)
     tick = {
         "time_s": STARTED_S + exposed_s + delay_s + random.exponential(0.0005, len(exposed_s)),
         "mid_exposure_s": STARTED_S + exposed_s - stamp_error_s,
@@ -76,6 +75,14 @@ def result(record, rig):
 def test_right_stamps_are_found_right_to_a_tenth_of_a_millisecond(result):
     assert result.stamp_error_s == pytest.approx(-SHOWN_LATE_S, abs=0.0001)
     assert not result.blurred
+
+
+@pytest.mark.parametrize("changed", ["camera.electrons_per_dn=1.0", "loops.right.sensor=fit"])
+def test_with_another_noise_of_the_star_it_is_as_good(changed):
+    other = load_rig(default_rig_path(), [changed])
+    found = delay.analyse(other, swings(other))
+    assert found.stamp_error_s == pytest.approx(-SHOWN_LATE_S, abs=0.0001)
+    assert found.left < 0.6 * delay._MOST_LEFT
 
 
 def test_the_delay_is_the_median_from_true_exposure_to_command(result):

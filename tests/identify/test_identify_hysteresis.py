@@ -6,7 +6,7 @@ import pytest
 import tomli_w
 from plant_records import record_of
 
-from fitctl.config import StackHysteresis, rig_from_document
+from fitctl.config import StackHysteresis, default_rig_path, load_rig, rig_from_document
 from fitctl.identify import hysteresis
 from fitctl.identify.errors import IdentifyError
 from fitctl.identify.plays import trail
@@ -58,6 +58,16 @@ def test_the_model_gives_the_plants_output_within_half_a_percent(rig, result):
     assert np.all(output_errors(rig, result) < 0.0025)
     assert np.all(result.output_sd < 0.0025)
     assert result.excess < 1.2
+
+
+@pytest.mark.parametrize("changed", ["camera.electrons_per_dn=1.0", "loops.right.sensor=fit"])
+def test_with_another_noise_of_the_star_it_is_as_good(changed):
+    other = load_rig(default_rig_path(), [changed])
+    found = hysteresis.analyse(
+        other, record_of(other, "right", hysteresis.plan(other, "right"), seed=1)
+    )
+    assert np.all(output_errors(other, found) < 0.0025)
+    assert found.excess < 1.2
 
 
 def test_it_does_not_matter_what_the_stacks_did_before(rig):

@@ -59,7 +59,7 @@ class FeedforwardResult:
         What the largest standard deviation of an element leaves of the star's motion, for a millimetre of the
         collector's.
     excess : float
-        RMS of what is left, over what the rig file's air path and centroid noise explain.
+        RMS of what is left, over what the rig file's air path and the sensor's noise explain.
     frames : int
     left_out : float
         The fraction of them that the fit leaves out as outliers.
@@ -177,7 +177,7 @@ def analyse(rig: Rig, loop_name: str, ticks: Columns) -> FeedforwardResult:
     )
     design = np.column_stack([link_px, direction, second, ~second])[known]
     times_s, link_px, undone_px = times_s[known], link_px[known], undone_px[known]
-    whiten = whitener(rig, loop_name, times_s)
+    whiten = whitener(rig, loop_name, times_s, least_noise_px=0.0)
     white, wanted = whiten(design), whiten(undone_px)
     solution, kept = _solve_without_outliers(white, wanted)
     white, wanted = white[kept], wanted[kept]

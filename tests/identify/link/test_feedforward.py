@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from fitctl.config import default_rig_path, load_rig
+from fitctl.controllers.centroid import sensor_noise_px
 from fitctl.identify.backlash import behind_play
 from fitctl.identify.errors import IdentifyError
 from fitctl.identify.link import feedforward
 from fitctl.model import air_path
 from fitctl.model.hysteresis import displacement_series
-from fitctl.model.image.light import centroid_noise_px
 from fitctl.model.optics import (
     mirror_from_stacks,
     motor_sky_rad_per_rad,
@@ -77,7 +77,7 @@ def scan(seed, swing_arcsec=60.0, rig=RIG, jumps_arcsec=0.0):
         volts - volts[0], np.array(hysteresis.half_widths_v), np.array(hysteresis.gains_m_per_v)
     )
     mirror_rad = mirror_from_stacks(displacement_m, fsm.stack_radius_m)
-    noise_px = centroid_noise_px(RIG.camera, LOOP.star_flux_dn, 7)
+    noise_px = sensor_noise_px(rig.camera, rig.stellar_loops["left"], LOOP.star_flux_dn)
     star_px = np.array([12.0, 20.0]) + moved_px + scale.mirror_px(mirror_rad)
     star_px += noise_px * random.standard_normal(star_px.shape)
     link_sky = motor_sky_rad_per_rad(RIG.metrology_loops["metrology"].siderostat)
@@ -105,6 +105,17 @@ def test_the_interval_of_each_element_holds_the_truth_as_often_as_it_says():
     assert 0.89 <= np.mean(inside) <= 0.99
     assert np.mean([one.matrix_sd for one in found]) < 0.003
     assert np.mean([one.excess for one in found]) == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize("changed", ["camera.electrons_per_dn=1.0", "loops.left.sensor=fit"])
+def test_the_noise_is_that_of_the_loop_s_sensor(changed):
+    other = load_rig(
+        default_rig_path().parent / "fit-testbed.toml",
+        [f"loops.left.feedforward.matrix={TRUTH.round(3).tolist()}", changed],
+    )
+    found = feedforward.analyse(other, "left", scan(1, rig=other))
+    assert np.all(np.abs(found.matrix - TRUTH) < 4 * found.matrix_sd)
+    assert 0.75 < found.excess < 1.1  # with the fit, the drift that the rig file expects counts
 
 
 def on_a_busy_computer(seed, stalls=15):
