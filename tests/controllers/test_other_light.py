@@ -1,11 +1,22 @@
 """A star beside another loop's spot is measured where it is."""
 
+import math
+
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from fitctl.config import Spot, default_rig_path, load_rig
 from fitctl.config.base import AxisPair
-from fitctl.controllers.centroid import OtherLight, StarSensor
+from fitctl.controllers.centroid import (
+    _STEPS_PER_PX,
+    OtherLight,
+    StarSensor,
+    _NearLight,
+    moving_with_star,
+    spot_light,
+)
 from fitctl.model.image.scene import Scene
 
 STAR = (28.2, 19.9)
@@ -60,6 +71,18 @@ def test_a_loops_own_spot_next_to_its_star_does_not_pull_a_fit(offset_px, part):
 
     # Without such a spot it is 0.0024 px.
     assert np.sqrt(np.mean(errors**2)) < 1.4 * 0.0024
+
+
+@given(st.tuples(*[st.floats(-40.0, 40.0)] * 2), st.floats(0.5, 6.0))
+def test_light_of_near_spots_is_that_of_any_spot(star_px, diameter_px):
+    loop = load_rig(default_rig_path()).loops["right"]
+    loop = loop.model_copy(update={"spot_diameter_px": diameter_px})
+    found = _NearLight(loop, loop.other_spots).of_star(*star_px)
+    (spot,) = moving_with_star(loop, loop.other_spots, *star_px, 1.0)
+
+    # A place that is wrong by half a step of the table, on both axes.
+    steepest = 4 / (math.sqrt(2 * math.pi) * diameter_px)
+    assert np.abs(found - spot_light(spot, 0, 0)).max() < spot.flux_dn * steepest / _STEPS_PER_PX
 
 
 @pytest.mark.parametrize("other_px", [(25.0, 20.0), (24.3, 20.3)])
