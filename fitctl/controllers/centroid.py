@@ -29,6 +29,9 @@ MAX_CANDIDATES = 6
 REACH_DIAMETERS = 1.0  # from the centre of a spot: beyond lies a part of its light in 10 000
 _EDGES_PX = np.arange(-HALF_WINDOW_PX, HALF_WINDOW_PX + 2.0) - 0.5
 _STEPS_PER_PX = 64  # of the table of near spots' light: a place is wrong by 0.008 px at most
+AS_EXPECTED_PX = (
+    0.1  # a star that is farther from where it was expected is fitted again, beside its near spots
+)
 LARGEST_PEAK = 0.6  # of a spot's light in its brightest pixel; a hot pixel has all of it
 
 
@@ -100,8 +103,7 @@ class StarSensor:
     other_light : list of OtherLight
         Spots of other loops. Their light is subtracted from a window, or it would pull this loop's star.
     near_spots : list of OtherSpot
-        The loop's own other spots, where their light reaches into the star's window: it is subtracted before a
-        fit, with the star where it is expected.
+        The loop's own other spots, where their light reaches into the star's window: a fit subtracts it.
     """
 
     def __init__(self, camera: Camera, loop: Loop) -> None:
@@ -211,16 +213,32 @@ class StarSensor:
         if self.fit is None:
             sigma_px = self._centroid_sigma_px
             return Star(az + az_px, el + el_px, flux_dn, az, el, sigma_px, sigma_px)
+        expected_px = window_az_px - az, window_el_px - el
         top, left = el - HALF_WINDOW_PX, az - HALF_WINDOW_PX
         without = self._dark.without_measurement(image, top, left, side, side)
-        if self.near_spots:
-            beside_star = self._near_light.of_star(window_az_px - az, window_el_px - el)
-            light_dn -= flux_dn / (1.0 + float(beside_star.sum())) * beside_star
-        place = self.fit.place(light_dn, az_px, el_px, without)
+        place = self.fit.place(
+            self._without_near(light_dn, flux_dn, expected_px), az_px, el_px, without
+        )
+        if (
+            place is not None
+            and self.near_spots
+            and math.dist(place[:2], expected_px) > AS_EXPECTED_PX
+        ):
+            lone_dn = self._without_near(light_dn, flux_dn, place[:2])
+            place = self.fit.place(lone_dn, *place[:2], without)
         if place is None:
             return None
         az_px, el_px, _, az_sigma_px, el_sigma_px = place
         return Star(az + az_px, el + el_px, flux_dn, az, el, az_sigma_px, el_sigma_px)
+
+    def _without_near(
+        self, light_dn: NDArray[np.float64], flux_dn: float, star_px: tuple[float, float]
+    ) -> NDArray[np.float64]:
+        """A window's light less that of near spots, with the star at a place from the window's centre."""
+        if not self.near_spots:
+            return light_dn
+        beside_star = self._near_light.of_star(*star_px)
+        return light_dn - flux_dn / (1.0 + float(beside_star.sum())) * beside_star
 
     def _accepted(self, star: Star | None) -> Star | None:
         if star is None or not self.flux_low_dn <= star.flux_dn <= self.flux_high_dn:

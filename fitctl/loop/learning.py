@@ -29,10 +29,11 @@ PAUSE_S, MOST_PAUSE_S = 60.0, 960.0
 # The mean square of the error, over a time constant, may pass that of the design before by a factor in RMS. The
 # comparison finds later what is worse by less.
 _RMS_LIMITS = ((0.3, 2.0), (10.0, 1.25))
-# A louder night is louder for the design before, too. Beyond so many times, it may as well be a fault: if the
-# loop is not as designs have it, the disturbance is rebuilt wrongly.
+# A louder night is louder for the design before, too. An error of more than so many times these limits is a
+# fault: if the loop is not as designs have it, the disturbance is rebuilt wrongly.
 _LOUDER = 2.0
-# There a frame counts as at most so many times the limit: a gust of a few frames is no fault.
+# For that, a frame counts as at most so many times what the design before left: a gust of a few frames is no
+# fault.
 _MOST_OF_A_FRAME = 5.0
 MOST_NOISE_RATIO = 1.1
 """Another light of the star is another noise of the sensor. One that differs by less is not worth another
@@ -235,11 +236,17 @@ class Learning:
             self._judge_from(now_s + CALM_S)
         if is_gap:
             self._calm_since_s = None
-            self._restart_comparison(now_s)
-        if hindered or is_other_rate or error_px is None or moved or saturated:
+            self._restart_comparison()
+        if hindered or is_other_rate or error_px is None or moved:
             self._calm_since_s = None
-            self._restart_comparison(now_s)
+            self._restart_comparison()
             return ""
+        if saturated:
+            self._calm_since_s = None
+            self._restart_comparison()
+            self._compared_from_s = now_s + CALM_S
+            # A mirror that is not as designs have it can be driven from end to end.
+            return "" if self.in_force is None else self._why_back(error_px, now_s, saturated=True)
         if self._calm_since_s is None:
             self._calm_since_s = now_s
         if self.in_force is None:
@@ -250,33 +257,29 @@ class Learning:
         return self._why_back(error_px, now_s)
 
     def _judge_from(self, time_s: float) -> None:
-        """Judge the design's residual from a time on, as if it had left what it promised."""
+        """Limit the design's residual from a time on, as if it had left what it promised."""
         self._judged_from_s = time_s
-        self._forget(self._means_px2, self._before_px2, self._cut_px2)
+        if self.in_force is not None:
+            for means in itertools.chain(self._means_px2, self._before_px2, self._cut_px2):
+                means[:] = [self.in_force.learnt_camera_px**2] * 2
 
-    def _restart_comparison(self, now_s: float) -> None:
-        """Compare with the design before once both have followed the star for a while again."""
-        self._compared_from_s = now_s + CALM_S
-        self._forget(self._means_px2, self._before_px2)
+    def _restart_comparison(self) -> None:
         if self._comparison is not None:
             self._comparison.restart()
 
-    def _forget(self, *of_windows: list[list[float]]) -> None:
-        if self.in_force is not None:
-            for means in itertools.chain(*of_windows):
-                means[:] = [self.in_force.learnt_camera_px**2] * 2
-
-    def _why_back(self, error_px: AzEl, now_s: float) -> str:
+    def _why_back(self, error_px: AzEl, now_s: float, *, saturated: bool = False) -> str:
         comparison = self._comparison
         worse = "" if comparison is None else comparison.why_back
         if now_s < self._judged_from_s:
             return worse
         compares = now_s >= self._compared_from_s
-        before_px = error_px if comparison is None else comparison.before_error_px
+        before_px = (0.0, 0.0) if comparison is None else comparison.before_error_px
         most_px2 = (_MOST_OF_A_FRAME * self._limit_px) ** 2
         for (over_s, factor), keep, means, before, cut in zip(
             _RMS_LIMITS, self._keep, self._means_px2, self._before_px2, self._cut_px2, strict=True
         ):
+            if saturated and over_s < CALM_S:
+                continue
             for axis in (0, 1):
                 px2 = error_px[axis] ** 2
                 cut[axis] = keep * cut[axis] + (1.0 - keep) * min(px2, most_px2)
@@ -292,7 +295,7 @@ class Learning:
             elif max(cut) > (factor * _LOUDER * self._limit_px) ** 2:
                 worse = (
                     f"the learnt design leaves {math.sqrt(max(cut)):.4f} px on frames over {over_s:g} s; the "
-                    f"design before left {self._limit_px:.4f}, and no night is so much louder"
+                    f"design before left {self._limit_px:.4f}, and the limit is {_LOUDER:g} times that"
                 )
         return worse
 

@@ -73,6 +73,21 @@ def test_a_loops_own_spot_next_to_its_star_does_not_pull_a_fit(offset_px, part):
     assert np.sqrt(np.mean(errors**2)) < 1.4 * 0.0024
 
 
+def test_a_star_beside_its_own_spot_is_fitted_as_well_where_it_was_not_expected():
+    own = "{name='ghost',offset_px={az=3.2,el=0.0},flux_dn=8000.0}"
+    fitted = load_rig(
+        default_rig_path(), ["loops.right.sensor=fit", f"loops.right.other_spots=[{own}]"]
+    )
+    sensor = StarSensor(fitted.camera, fitted.loops["right"])
+    star_px = np.array([20.1, 19.8])
+    images = [frame(fitted, star_px + np.array([3.2, 0.0]), 8000.0, star_px, n) for n in range(200)]
+    found = [
+        sensor.measure(image, *(star_px + np.array([0.5, -0.5]))).position_px for image in images
+    ]
+
+    assert np.mean(found, axis=0) == pytest.approx(star_px, abs=0.002)
+
+
 @given(st.tuples(*[st.floats(-40.0, 40.0)] * 2), st.floats(0.5, 6.0))
 def test_light_of_near_spots_is_that_of_any_spot(star_px, diameter_px):
     loop = load_rig(default_rig_path()).loops["right"]

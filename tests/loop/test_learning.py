@@ -414,7 +414,7 @@ def test_a_gust_is_no_reason_to_go_back(lasts_s):
     assert [change.reason for change in night.changes()[1:]] == []
 
 
-def observe_frames(learning, errors_px, *, saturated=False, from_s=0.0):
+def observe_frames(learning, errors_px, *, saturated=False, from_s=0.0, target_px=(28.0, 20.0)):
     """Frames of a star at rest on its target; the reasons to go back."""
     return [
         reason
@@ -424,7 +424,7 @@ def observe_frames(learning, errors_px, *, saturated=False, from_s=0.0):
                 from_s + 0.02 * number,
                 from_s + 0.02 * number - 0.02,
                 (error_px, 0.0),
-                (28.0, 20.0),
+                target_px,
                 (np.zeros(2), np.zeros(2)),
                 saturated=saturated,
                 hindered=False,
@@ -433,7 +433,7 @@ def observe_frames(learning, errors_px, *, saturated=False, from_s=0.0):
     ]
 
 
-def test_nothing_is_judged_while_the_mirror_is_saturated():
+def test_a_mirror_that_is_saturated_for_a_while_is_no_reason_to_go_back():
     rig = load_rig(default_rig_path())
     before, now = design_minimum_variance(PAPER), design_with_margins(PAPER)
     learning = Learning(rig, "right")
