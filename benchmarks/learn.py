@@ -21,7 +21,7 @@ import numpy as np
 
 from benchmarks.linear_loop import held
 from fitctl.config import Rig, default_rig_path, load_rig
-from fitctl.controllers.design.basis import Basis, Line, basis
+from fitctl.controllers.design.basis import Basis, Line, basis, with_plants_air
 from fitctl.controllers.design.files import save_design
 from fitctl.controllers.design.linear_loop.bound import bound, linear_residual
 from fitctl.controllers.design.linear_loop.spectrum import air_of
@@ -98,12 +98,7 @@ class Outcome(NamedTuple):
 
 def truth_of(rig: Rig, shaken: tuple[Line, ...]) -> Basis:
     """What an omniscient designer would know."""
-    plant = rig.mock_parts()[0].stellar_loops[LOOP].air_path
-    own = basis(rig, LOOP)
-    air = own.air_path.model_copy(
-        update={name: getattr(plant, name) for name in ("gain_px", "b1_s2", "b2_s")}
-    )
-    return dataclasses.replace(own, air_path=air, lines=shaken)
+    return dataclasses.replace(with_plants_air(basis(rig, LOOP), rig, LOOP), lines=shaken)
 
 
 def ticks_of(run: LoopRun, step_s: float) -> dict[str, np.ndarray]:

@@ -308,9 +308,7 @@ class Invariants:
         if isinstance(command, Stop):
             for name in self._named(command):
                 self._stopped_s[name] = self._clock.now_s()
-        elif isinstance(
-            command, SetBiasOffset | Off
-        ):  # the second takes the mirror from its offset
+        elif isinstance(command, SetBiasOffset | Off):  # `off` ends an offset
             for name in self._named(command):
                 self.mirror_moved(name)
         elif isinstance(command, Jog):

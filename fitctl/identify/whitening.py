@@ -29,7 +29,7 @@ def whitener(
 
     It is the Kalman filter of the rig's own models (air path, drift as a random walk, noise of the loop's
     sensor): its innovations, over their standard deviation. Applied to star positions and regressors alike,
-    ordinary least squares becomes the generalized one (Gauss-Markov), and an unknown constant is taken out too.
+    ordinary least squares becomes the generalized one (Gauss-Markov). It also removes an unknown constant.
 
     Parameters
     ----------

@@ -432,11 +432,10 @@ class StellarLoop(Loop):
     def _start_search(self, motor_rad: Floats) -> None:
         """As asked; else about where the star is expected: on the target, or where it was last seen."""
         again, self._search_due = bool(self._search_due), None
-        if self.link is not None and not (
-            self._link_counts and self.search.asked_place_sky_arcsec is None
-        ):
-            # What the link's siderostat turned before, to find its beam, moved no star that was known. A place
-            # that a command gives is one with the link as it is now.
+        asked = self.search.asked_place_sky_arcsec is not None
+        if self.link is not None and (asked or not self._link_counts):
+            # What the link's siderostat turned before, to find its beam, moved no star that was known. A
+            # command that gives a place means it with the link as it is now.
             self.link.set_origin()
             if not self._is_recalled:
                 self.star_finder.estimator.forget()

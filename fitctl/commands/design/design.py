@@ -25,7 +25,7 @@ from fitctl.commands.shared.printing import say_lines, to_json
 from fitctl.commands.shared.rig import require_loop, rig_of
 from fitctl.config import ConfigError, Rig
 from fitctl.controllers.design import coarse, lqg_ltr
-from fitctl.controllers.design.basis import Basis, Line, basis, night_of
+from fitctl.controllers.design.basis import Basis, Line, basis, night_of, with_plants_air
 from fitctl.controllers.design.choose import DESIGNS, design_for, solving
 from fitctl.controllers.design.deadzone import DeadzoneResult, deadzone_result
 from fitctl.controllers.design.draw import draw_loop_shapes, save_figure
@@ -290,21 +290,19 @@ def _bound(rig: Rig, loop: str) -> Report:
 
 def _plant_bound_px(rig: Rig, loop: str, its_basis: Basis) -> float | None:
     """With the air path and the lines of the rig file's plant; None if the loop's model has the same."""
-    plant = None if rig.plant is None else rig.plant.stellar_loops[loop]
-    if plant is None:
+    if rig.plant is None or rig.mocks is None:
         return None
-    true_air = {name: getattr(plant.air_path, name) for name in ("gain_px", "b1_s2", "b2_s")}
-    air = its_basis.air_path.model_copy(update=true_air)
-    if air == its_basis.air_path and not plant.lines:
+    lines, in_its_air = rig.plant.stellar_loops[loop].lines, with_plants_air(its_basis, rig, loop)
+    if in_its_air.air_path == its_basis.air_path and not lines:
         return None
     residuals_px = []
     for along in (math.cos, math.sin):
         shaken = tuple(
             Line(each.frequency_hz, max(each.damping, _SINE), each.rms_px * part)
-            for each in plant.lines
+            for each in lines
             if (part := abs(along(math.radians(each.direction_deg)))) > _ACROSS
         )
-        night = dataclasses.replace(its_basis, air_path=air, lines=shaken)
+        night = dataclasses.replace(in_its_air, lines=shaken)
         residuals_px.append(bound(night).residual_px)
     return max(residuals_px)
 

@@ -167,6 +167,19 @@ def on_its_mirror(basis: Basis, parameters: Mapping[str, Any]) -> Basis:
     )
 
 
+def with_plants_air(own: Basis, rig: Rig, loop_name: str) -> Basis:
+    """With the air path of the rig file's plant in place of the loop's model.
+
+    Raises
+    ------
+    ConfigError
+        If the rig file has no plant.
+    """
+    plant = rig.mock_parts()[0].stellar_loops[loop_name].air_path
+    true_air = {name: getattr(plant, name) for name in ("gain_px", "b1_s2", "b2_s")}
+    return replace(own, air_path=own.air_path.model_copy(update=true_air))
+
+
 def night_of(design: Design, rig_basis: Basis) -> Basis:
     """The night that a design expects: the one it was made for if it is learnt, otherwise the rig file's."""
     if not design.learnt:

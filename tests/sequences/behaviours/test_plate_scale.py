@@ -205,16 +205,20 @@ UNEVEN = [
 ]
 
 
-@pytest.mark.long
-def test_gains_of_the_axes_are_measured_and_the_fragment_undoes_them(tmp_path):
-    rig = load_rig(default_rig_path(), UNEVEN)
+def written_for(rig, folder):
+    """What the fragment that the step writes has for the right loop."""
     with Instrument(rig, simulate=True, seed=1) as instrument:
         instrument.acquire()
         instrument.wait(5.0)
         instrument.plate_scale(attempts=2)
-        (path,) = instrument.write_calibrations(tmp_path)
+        (path,) = instrument.write_calibrations(folder)
+    return tomllib.loads(path.read_text())["loops"]["right"]
 
-    written = tomllib.loads(path.read_text())["loops"]["right"]
+
+@pytest.mark.long
+def test_gains_of_the_axes_are_measured_and_the_fragment_undoes_them(tmp_path):
+    rig = load_rig(default_rig_path(), UNEVEN)
+    written = written_for(rig, tmp_path)
     screw = RIG.loops["right"].siderostat.ball_screw_m_per_rad
     scale = {
         "siderostat": written["siderostat"]["ball_screw_m_per_rad"] / screw,
@@ -375,13 +379,7 @@ def test_gains_of_the_rig_file_that_are_wrong_are_found_out(tmp_path):
         [f"loops.right.{stage}.axis_gains={wrong}" for stage in ("siderostat", "fsm")]
         + [f"plant.loops.right.{stage}_axis_gains={even}" for stage in ("siderostat", "fsm")],
     )
-    with Instrument(rig, simulate=True, seed=1) as instrument:
-        instrument.acquire()
-        instrument.wait(5.0)
-        instrument.plate_scale(attempts=2)
-        (path,) = instrument.write_calibrations(tmp_path)
-
-    written = tomllib.loads(path.read_text())["loops"]["right"]
+    written = written_for(rig, tmp_path)
     for stage in ("siderostat", "fsm"):
         assert np.array(written[stage]["axis_gains"]) == pytest.approx(np.eye(2), abs=0.03), stage
 
