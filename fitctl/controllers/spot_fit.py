@@ -82,7 +82,8 @@ class SpotPlace(NamedTuple):
     flux_dn : float
         All its light.
     az_sigma_px, el_sigma_px : float
-        One standard deviation, from pixel noise and photons, both as large as the pixels' misfit says.
+        One standard deviation, from pixel noise and photons, both as large as the pixels' misfit says. For a
+        narrow spot it includes the error between nodes.
     """
 
     az_px: float
@@ -245,8 +246,9 @@ class SpotFit:
             az_weights, el_weights = az_weights * noise_dn, el_weights * noise_dn
         freedom = pixels_dn.size - len(without) - _AMOUNTS
         scale = math.sqrt(left_dn.dot(left_dn) / freedom) / found.flux_dn
-        az_sigma_px = scale * math.sqrt(az_weights.dot(az_weights))
-        el_sigma_px = scale * math.sqrt(el_weights.dot(el_weights))
+        between_px = self._between_px
+        az_sigma_px = math.hypot(scale * math.sqrt(az_weights.dot(az_weights)), between_px)
+        el_sigma_px = math.hypot(scale * math.sqrt(el_weights.dot(el_weights)), between_px)
         return SpotPlace(found.az_px, found.el_px, found.flux_dn, az_sigma_px, el_sigma_px)
 
     def _converge(

@@ -245,7 +245,8 @@ class ServoBus(Protocol):
     Attributes
     ----------
     meanwhile : callable or None
-        Called again and again while amplifiers wait for an answer, as during their opening.
+        Called again and again while amplifiers wait for an answer, as during their opening. Without it,
+        amplifiers put off what may wait long until a later period.
     """
 
     meanwhile: Callable[[], None] | None

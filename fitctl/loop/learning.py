@@ -75,7 +75,7 @@ class Learning:
         self._before_px2 = [[0.0, 0.0] for _ in _RMS_LIMITS]
         self._cut_px2 = [[0.0, 0.0] for _ in _RMS_LIMITS]
         self._limit_px = math.inf
-        self._judged_from_s = self._compared_from_s = -math.inf
+        self._limited_from_s = self._compared_from_s = -math.inf
         self._by_hand = False
         self._calm_since_s: float | None = None
         self._paused_until_s = -math.inf
@@ -186,7 +186,7 @@ class Learning:
             for seen in recent:
                 self._comparison.observe(seen.error_px, seen.mirror_rad, seen.motor_rad)
         self._limit_px = max(report.measured_px, report.learnt_camera_px)
-        self._judge_from(-math.inf)
+        self._limit_from(-math.inf)
 
     def fell_back(self, reason: str, now_s: float) -> None:
         """The previous design is in force again."""
@@ -233,7 +233,7 @@ class Learning:
         self._last_s = now_s
         if is_gap or hindered:
             # The star is caught again first: that says nothing of the design.
-            self._judge_from(now_s + CALM_S)
+            self._limit_from(now_s + CALM_S)
         if is_gap:
             self._calm_since_s = None
             self._restart_comparison()
@@ -256,9 +256,9 @@ class Learning:
             error_px = self._comparison.error_px
         return self._why_back(error_px, now_s)
 
-    def _judge_from(self, time_s: float) -> None:
+    def _limit_from(self, time_s: float) -> None:
         """Limit the design's residual from a time on, as if it had left what it promised."""
-        self._judged_from_s = time_s
+        self._limited_from_s = time_s
         if self.in_force is not None:
             for means in itertools.chain(self._means_px2, self._before_px2, self._cut_px2):
                 means[:] = [self.in_force.learnt_camera_px**2] * 2
@@ -270,7 +270,7 @@ class Learning:
     def _why_back(self, error_px: AzEl, now_s: float, *, saturated: bool = False) -> str:
         comparison = self._comparison
         worse = "" if comparison is None else comparison.why_back
-        if now_s < self._judged_from_s:
+        if now_s < self._limited_from_s:
             return worse
         compares = now_s >= self._compared_from_s
         before_px = (0.0, 0.0) if comparison is None else comparison.before_error_px

@@ -151,6 +151,12 @@ def rotation(angle_deg: float) -> Floats:
     return np.array([[cos, -sin], [sin, cos]])
 
 
+def gains_of(matrix: Floats, rotation_deg: float) -> list[list[float]]:
+    """The `axis_gains`, row by row, that multiply with a stage's rotation to the matrix, shape (2, 2)."""
+    gains = rotation(rotation_deg).T @ matrix
+    return [[round(gain, 4) + 0.0 for gain in row] for row in gains.tolist()]  # 0.0, not -0.0
+
+
 AzEl = tuple[float, float]
 Rows = tuple[AzEl, AzEl]
 """A matrix of shape (2, 2), row by row, in plain floats: for one pair ten times as quick as an array."""

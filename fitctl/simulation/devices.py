@@ -224,6 +224,7 @@ class SimulatedHexapod:
         )
         self._trajectory = at_rest(np.zeros(6))
         self._referenced = mock.referenced
+        self._reference_ends_s = -math.inf
 
     def open(self) -> DeviceIdentity:
         """Nothing to connect."""
@@ -233,6 +234,7 @@ class SimulatedHexapod:
         """Begin to go to where all axes are at zero; the real one returns when it is there."""
         self._go_to(Pose(), self._limits)
         self._referenced = True
+        self._reference_ends_s = self._trajectory.ends_s
 
     def move_to(self, pose: Pose, velocity_mm_s: float) -> None:
         """Start a move from where it is, or give a running one a new target.
@@ -260,7 +262,8 @@ class SimulatedHexapod:
         return HexapodReading(now_s, pose, moving, self._referenced, servos_on=True, error="")
 
     def stop(self) -> None:
-        """Brake where it is."""
+        """Brake where it is; without the end of its reference move it is not referenced."""
+        self._referenced = self._referenced and self._clock.now_s() >= self._reference_ends_s
         self._follow(plan_stop(self._trajectory, self._clock.now_s(), self._limits))
 
     def close(self) -> None:

@@ -259,7 +259,7 @@ def simulate_rig(
     return RigResult(loops, _visibility(simulation), speed_x)
 
 
-def _judged_from_s(simulation: Simulation, name: str) -> float:
+def _counted_from_s(simulation: Simulation, name: str) -> float:
     """From when on a loop is judged: it has settled, and the collector moves where it will; nan without."""
     held = Mode.LOCKED if name in simulation.rig.metrology_loops else Mode.VERNIER
     held_s = _reached_s(simulation, name, held) + SETTLE_S
@@ -287,7 +287,7 @@ def _result_of(
 
 def _metrology_result(simulation: Simulation, name: str, speed_x: float) -> MetrologyResult:
     part = simulation.plant.metrology_loops[name]
-    start_s, end_s = _judged_from_s(simulation, name), simulation.clock.now_s()
+    start_s, end_s = _counted_from_s(simulation, name), simulation.clock.now_s()
     beam_m = part.history_offset_m(start_s, end_s)[:, 0] if start_s < end_s else np.empty((0, 2))
     beam_arcsec = beam_m / part.sensor.link_length_m * ARCSEC_PER_RAD
     return MetrologyResult(
@@ -310,7 +310,7 @@ def _visibility(simulation: Simulation) -> float:
     fringes = simulation.rig.fringes
     if fringes is None:
         return math.nan
-    start_s = max(_judged_from_s(simulation, name) for name in fringes.loops)
+    start_s = max(_counted_from_s(simulation, name) for name in fringes.loops)
     if not start_s < simulation.clock.now_s():
         return math.nan
     one_px, other_px = (
@@ -326,7 +326,7 @@ def _result(simulation: Simulation, name: str, speed_x: float) -> SimulationResu
     changes = [change for change in simulation.mode_changes if change.loop == name]
     ticks = [tick for tick in simulation.ticks if tick.loop == name]
     end_s = simulation.clock.now_s()
-    start_s = _judged_from_s(simulation, name)
+    start_s = _counted_from_s(simulation, name)
     judged = [t for t in ticks if t.time_s >= start_s and t.star_visible]
     true_px = true_residual_rms(
         simulation.plants[name], simulation.supervisor.stellar_loops[name].target_px, start_s, end_s

@@ -174,6 +174,19 @@ def test_a_hexapod_that_is_stopped_brakes(simulation):
     assert reading.pose.y_mm == pytest.approx(1.6 + 0.6 * 8.0 + 1.6, abs=1e-6)
 
 
+def test_a_hexapod_that_is_stopped_in_its_reference_move_is_not_referenced(simulation):
+    simulation.hexapod.reference()
+    simulation.hexapod.move_to(Pose(y_mm=4.0), 8.0)
+    go_on(simulation, 2.0)
+    simulation.hexapod.reference()
+    simulation.hexapod.stop()
+    assert not simulation.hexapod.pose().referenced
+    simulation.hexapod.reference()
+    go_on(simulation, 2.0)
+    simulation.hexapod.stop()
+    assert simulation.hexapod.pose().referenced
+
+
 # ---------------------------------------------------------------- figure of merit
 
 

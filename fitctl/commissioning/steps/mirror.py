@@ -16,14 +16,13 @@ from fitctl.commissioning.steps.plate import (
     ROTATION_APART_DEG,
     SCALE_APART,
     Floats,
-    gains_of,
     similar,
     turned_further,
     uneven_line,
 )
 from fitctl.commissioning.steps.sky import Watch, displaced
 from fitctl.controllers.mirror import Mirror
-from fitctl.model.optics import scales, stage_turn
+from fitctl.model.optics import gains_of, scales, stage_turn
 
 STACK_V = 2.5
 _SWINGS = 3
@@ -187,15 +186,20 @@ def _mirror_outcome(site: Site, seen: Floats, expected: Floats, furthest_v: floa
 
 def _common_scale(site: Site, scale: float) -> dict[str, Any]:
     """What corrects the mirror's scale and the siderostat's at once, if both were wrong by the same."""
-    before = site.figures.get(f"{site.name}.siderostat.scale_over_expected{BEFORE}", 1.0)
+    figures = site.figures
+    before = figures.get(f"{site.name}.siderostat.scale_over_expected{BEFORE}", 1.0)
     if abs(scale / before - 1) > _SAME_SCALE or len(site.rig.stellar_loops) > 1:
         return {}
     siderostat = site.loop.siderostat
     focal_m = site.rig.optics.focal_length_m * scale
-    back = {
+    back: dict[str, Any] = {
         "spur_gear_ratio": round(siderostat.spur_gear_ratio * before, 2),
         "travel_sky_arcsec": round(siderostat.travel_sky_arcsec / min(before, 1.0), 1),
     }
+    uneven = figures.get(f"{site.name}.siderostat.uneven{BEFORE}", 1.0)
+    if uneven > EVEN:  # its step has put the scale into the gains
+        turn = stage_turn(siderostat.rotation_deg, siderostat.axis_gains)
+        back = {"axis_gains": gains_of(turn / before, siderostat.rotation_deg)}
     return {"optics": {"focal_length_m": round(focal_m, 4)}} | site.found(siderostat=back)
 
 

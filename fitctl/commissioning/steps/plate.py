@@ -15,7 +15,7 @@ from fitctl.commissioning.steps.motors import powered
 from fitctl.commissioning.steps.sky import Watch, displaced, search, to_the_star
 from fitctl.config.wiring import STRAIGHT
 from fitctl.controllers.centroid import Star
-from fitctl.model.optics import rotation, scales
+from fitctl.model.optics import gains_of, scales
 
 Floats = NDArray[np.float64]
 ROUGH_RAD = 0.35
@@ -58,12 +58,6 @@ def similar(matrix: Floats) -> Similar:
 def turned_further(rotation_deg: float, by_deg: float) -> float:
     """The rig file's `rotation_deg`, corrected by a measured difference."""
     return round((rotation_deg + by_deg + 180) % 360 - 180, 1)
-
-
-def gains_of(matrix: Floats, rotation_deg: float) -> list[list[float]]:
-    """The `axis_gains`, row by row, that multiply with a stage's rotation to the matrix, shape (2, 2)."""
-    gains = rotation(rotation_deg).T @ matrix
-    return [[round(float(one), 3) + 0.0 for one in row] for row in gains]  # 0.0, not -0.0
 
 
 def uneven_line(off: Similar) -> str:

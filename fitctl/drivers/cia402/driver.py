@@ -347,10 +347,13 @@ class Cia402Amplifiers(_Base):
 
         On both the oldest SYNC stays unanswered. By the time that the drive answers a request it has
         long sent its TPDOs of earlier SYNCs: those that have not come before the answer never will. It
-        costs a round trip, but only when behind.
+        costs a round trip, but only when behind. On a bus where no other drive is servoed meanwhile, such as
+        in a period between two answers that another drive waits for, it is left to a later period: a silent
+        drive would hold up all others for the whole time limit.
         """
         self._behind = self._behind + 1 if self._encoders.outstanding else 0
-        if self._behind >= _BEHIND_PERIODS:
+        may_wait = self._bus is None or self._bus.meanwhile is not None
+        if self._behind >= _BEHIND_PERIODS and may_wait:
             self._behind = 0
             self._opened().read(protocol.ERROR_REGISTER, 0, "B")
             self._encoders.give_up()

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from fitctl.config import Fsm, Loop, Rig
 from fitctl.controllers.mirror import Mirror
 from fitctl.model.drives import FSM, SIDEROSTAT, Drive, channel_values
-from fitctl.model.optics import Scales, rotation, scales
+from fitctl.model.optics import Scales, gains_of, scales
 from fitctl.sequences import steps
 from fitctl.sequences.behaviours.behaviour import Calibration, Result
 from fitctl.sequences.behaviours.open_loop import open_loop, watched
@@ -208,11 +208,11 @@ def axis_gains(
         The rig file's `axis_gains`. The result replaces them, even by the identity. Without them, the result
         is None if it differs too little from the identity.
     """
-    gains = rotation(rotation_deg(matrix)).T @ matrix / scale
+    gains = gains_of(matrix / scale, rotation_deg(matrix))
     surely = max(_LEAST_DIFFERENCE, _SIGMAS * float(deviation.max()))
-    if before is None and np.abs(gains - np.eye(2)).max() < surely:
+    if before is None and np.abs(np.array(gains) - np.eye(2)).max() < surely:
         return None
-    return [[round(gain, 4) + 0.0 for gain in row] for row in gains.tolist()]  # 0.0, not -0.0
+    return gains
 
 
 def rotation_sd_deg(matrix: Floats, deviation: Floats) -> float:

@@ -1,6 +1,7 @@
 """What measured motions of the star make of the rig file: order, signs, rotation, scale."""
 
 import itertools
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,7 +11,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from fitctl.clock import VirtualClock
-from fitctl.commissioning.outcome import StepError
+from fitctl.commissioning.outcome import BEFORE, StepError
 from fitctl.commissioning.steps.mirror import _mirror_outcome
 from fitctl.commissioning.steps.motors import Motors
 from fitctl.commissioning.steps.plate import (
@@ -156,6 +157,32 @@ def test_with_what_is_found_the_mirror_of_any_rig_file_has_the_measured_response
     again = corrected(rig, "fsm", said)
     off = truth @ np.linalg.inv(scales(again, again.loops["right"]).mirror_turn)
     assert_corrected(off, said, scale_apart=0.161)
+
+
+@pytest.mark.parametrize("seen", [1.4 * np.eye(2), np.diag([1.2, 1.7])])
+def test_a_focal_length_that_explains_both_scales_leaves_the_siderostat_s_response(seen):
+    """The siderostat's step puts the scale into the gear, or into the gains of uneven axes."""
+    first = _siderostat_outcome(site_of(), seen, 0.0)
+    rig = corrected(RIG, "siderostat", found(first, "siderostat"))
+    figures = {f"right.siderostat.{key}{BEFORE}": value for key, value in first.figures.items()}
+    size = first.figures["scale_over_expected"]
+
+    outcome = _mirror_outcome(
+        replace(site_of(rig), figures=figures), size * STRAIGHT, STRAIGHT, 0.0
+    )
+
+    again = corrected(rig, "siderostat", found(outcome, "siderostat"))
+    optics = again.optics.model_copy(update=outcome.found["optics"])
+    again = again.model_copy(update={"optics": optics})
+    response = [
+        px_per_rad(each) * scales(each, each.loops["right"]).siderostat_turn
+        for each in (rig, again)
+    ]
+    assert response[1] == pytest.approx(response[0], rel=1e-3)
+    siderostat = again.loops["right"].siderostat
+    assert siderostat.spur_gear_ratio == pytest.approx(
+        RIG.loops["right"].siderostat.spur_gear_ratio
+    )
 
 
 def test_axes_of_a_mirror_that_are_even_replace_the_gains_of_the_rig_file():

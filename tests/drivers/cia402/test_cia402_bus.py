@@ -356,6 +356,18 @@ def test_a_silent_drive_is_a_fault_of_its_servo_and_the_others_go_on_at_their_ra
 
 
 @pytest.mark.long
+def test_a_silent_drive_does_not_hold_up_the_others_while_another_drive_is_opened(servos, bench):
+    """Both want to wait for an answer then, which together cost the third drive the whole time limit."""
+    bench.fault(0, "freeze")
+    wait_until(lambda: servos[0].fault is not None)
+    begin_s = time.monotonic()
+    servos[1].open()
+    read_s = [at_s for reading in servos[2]._history if (at_s := reading.time_s) > begin_s]
+    gaps_s = np.diff([begin_s, *read_s, time.monotonic()])
+    assert max(gaps_s) < 0.5 * bench.drivers[0]._device.response_timeout_s
+
+
+@pytest.mark.long
 def test_a_drive_that_is_opened_again_leaves_the_others_servoed(servos, bench):
     bench.fault(0, "reboot")
     wait_until(lambda: servos[0].fault is not None)
