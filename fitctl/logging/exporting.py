@@ -7,7 +7,7 @@ import importlib
 import re
 from base64 import b64encode
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,7 @@ def export(path: Path, folder: Path, kind: str, topics: list[str]) -> dict[Path,
     path : Path
         A log, finished or not.
     folder : Path
-        Made if missing; no file in it is overwritten.
+        Made with the first file if missing; no file in it is overwritten.
     kind : str
         One of :data:`KINDS`.
     topics : list of str
@@ -54,15 +54,18 @@ def export(path: Path, folder: Path, kind: str, topics: list[str]) -> dict[Path,
     ------
     LogError
         If the log cannot be read, a file exists or cannot be written, or pyarrow is missing for Parquet.
-        No file is left then.
+        No file is left then, and no empty folder.
     """
     rows: dict[Path, int] = {}
+    existed = folder.exists()
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         _write_all(path, folder, kind, topics, rows)
     except BaseException as error:
         for file in rows:  # part of a log is not what was asked for
             file.unlink(missing_ok=True)
+        if not existed:
+            with suppress(OSError):
+                folder.rmdir()
         if isinstance(error, OSError):
             msg = f"{folder}: cannot be written: {error.strerror or error}; make room, or give another --out"
             raise LogError(msg) from error
@@ -88,6 +91,7 @@ def _write_all(
                 if file.exists():
                     msg = f"{file}: exists already; give another folder with --out"
                     raise LogError(msg)
+                folder.mkdir(parents=True, exist_ok=True)
                 rows[file] = 0
                 writers[topic] = KINDS[kind](file, stack)
             writers[topic](columns)
