@@ -10,15 +10,17 @@ import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+import numpy as np
 import psutil
 import pytest
+from scipy.signal import welch
 
-from fitctl.logging.reading import log_info
+from fitctl.logging.reading import log_info, tick_arrays
 from fitctl.messages.client import Client
 from fitctl.messages.commands import Recover, Shutdown
 from fitctl.messages.waiting import wait_for_end
 
-from .conftest import START_S, child, end, fitctl, folders, nothing_was_lost_without_a_stall
+from .conftest import NEAR, START_S, child, end, fitctl, folders, nothing_was_lost_without_a_stall
 
 pytestmark = pytest.mark.timeout(300)
 SUMMARY_KEYS = {
@@ -70,6 +72,41 @@ def test_the_demo_acquires_holds_and_sums_up(tmp_path, sockets):
     assert nothing_was_lost_without_a_stall(summary)
     assert summary["frames"] > 1000
     assert log_info(Path(summary["log"])).finished
+
+
+@pytest.mark.long
+def test_the_mocks_have_the_night_that_the_rig_file_describes(tmp_path, sockets):
+    """Over wires: a star that moves, a vibration, light with noise, smear, and pixels that become noisier."""
+    rate = "star_rate_sky_arcsec_s={az=6.0,el=-4.0}"
+    vibration = "frequency_hz=12.0,rms_px=0.1,direction_deg=0.0,damping=0.001,drift_hz_per_min=0.0"
+    night = (
+        f"loops.right.{rate}",
+        f"plant.loops.right.{rate}",
+        f"plant.loops.right.lines=[{{{vibration}}}]",
+        "plant.exposure_instants=5",
+        "plant.timeline=[{at_s=30.0,pixel_noise_dn=60.0}]",
+        "camera.electrons_per_dn=1.0",
+        "loops.right.sensor=fit",
+        NEAR,
+    )
+    overrides = [part for value in night for part in ("--set", value)]
+    summary = demo(tmp_path, sockets, "--duration", 45, "--seed", 3, *overrides)
+
+    ticks = tick_arrays(Path(summary["log"]), "right")
+    held = (ticks["mode"] == "VERNIER") & ticks["star_visible"]
+    time_s = (ticks["mid_exposure_s"] - np.nanmin(ticks["mid_exposure_s"]))[held]
+    for axis, rate_arcsec_s in (("az", 6.0), ("el", -4.0)):
+        turned_arcsec = ticks[f"siderostat_{axis}_sky_arcsec"][held]
+        assert np.polyfit(time_s, turned_arcsec, 1)[0] == pytest.approx(-rate_arcsec_s, rel=0.02)
+    frequency_hz, power = welch(ticks["error_az_px"][held], 50.0, nperseg=256)
+    assert frequency_hz[power.argmax()] == pytest.approx(12.0, abs=0.2)
+    before_px, after_px = (
+        np.median(ticks["star_sigma_az_px"][held][(time_s > from_s) & (time_s < to_s)])
+        for from_s, to_s in ((20.0, 27.0), (36.0, 44.0))
+    )
+    assert (
+        2.0 < after_px / before_px < 3.0
+    )  # three times the noise of a pixel; that of the light stays
 
 
 @pytest.mark.slow
