@@ -14,6 +14,7 @@ from fitctl.controllers.design.document import parameters_json
 from fitctl.controllers.design.margins import design_with_margins
 from fitctl.controllers.design.minimum_variance import design_minimum_variance
 from fitctl.logging.records import ControllerChange, Event
+from fitctl.loop import learning
 from fitctl.loop.learning import CALM_S, PAUSE_S, Learning
 from fitctl.messages.commands import (
     Acquire,
@@ -355,6 +356,17 @@ def test_a_design_that_does_worse_is_left_within_a_second():
     assert (back.source, back.target) == ("learnt", "minimum-variance")
     assert "the learnt design leaves" in back.reason
     assert night.loop.state(0.0).learning.state == "fell back"
+
+
+@pytest.mark.long
+def test_a_design_that_does_worse_is_left_also_where_nothing_can_be_compared(monkeypatch):
+    """As where the design before is unstable on the mirror that the learnt one was made for."""
+    monkeypatch.setattr(learning, "comparison", lambda *_: None)
+    night = Night("loops.right.vernier.controller=minimum-variance")
+    night.report(lines=(Line(4.0, 0.1, 0.3),), measured_px=0.0165, learnt_camera_px=0.0165)
+    night.simulation.run(1.0)
+
+    assert [change.target for change in night.changes()] == ["learnt", "minimum-variance"]
 
 
 @pytest.mark.long
