@@ -203,8 +203,8 @@ def _windows(frames: Iterable[TimedImage], camera: Camera, loop: Loop) -> _Windo
     if len(counts) < LEAST_FRAMES:
         more = f"; on {spoilt} more, half of its pixels are bad or saturated" if spoilt else ""
         msg = (
-            f"{len(counts)} frames show the star{more}; expected at least {LEAST_FRAMES}; hold the star and "
-            "record again"
+            f"{len(counts)} whole frames show the star{more}; expected at least {LEAST_FRAMES}; a log keeps "
+            "few but during the experiment of `fitctl identify spot`: hold the star and run that without --log"
         )
         raise IdentifyError(msg)
     return _Windows(np.array(lights_dn), np.array(counts))

@@ -36,8 +36,8 @@ def estimated(
     if opened is None:
         longest_s = max((len(one.disturbance_px) for one in series), default=0) * rig_basis.period_s
         msg = (
-            f"learn: the longest piece in VERNIER is {longest_s:.0f} s; expected at least {LEAST_S:.0f} s, "
-            "preferably two minutes, with a star held on its target; give a longer log"
+            f"learn: the longest piece in VERNIER is {longest_s:.0f} s, from where it has settled; expected at "
+            f"least {LEAST_S:.0f} s, preferably two minutes, with a star held on its target; give a longer log"
         )
         raise ConfigError(msg)
     night = estimate(opened, rig_basis.air_path, rig_basis.noise_px)

@@ -137,8 +137,8 @@ def held_by_controller(gathered: Gathered, loop_name: str, selection: Selection)
 def _spans(gathered: Gathered, loop_name: str) -> dict[str, list[tuple[float, float]]]:
     """From when to when each controller was in force."""
     spans: dict[str, list[tuple[float, float]]] = {}
-    for begin_s, end_s, name in _controllers(gathered, loop_name):
-        spans.setdefault(name, []).append((begin_s, end_s))
+    for one in _in_force(gathered, loop_name):
+        spans.setdefault(one.title, []).append((one.begin_s, one.end_s))
     return spans
 
 
@@ -187,24 +187,38 @@ def last_design(gathered: Gathered, loop_name: str) -> Design:
     ConfigError
         If its matrices are not in the log and cannot be made again.
     """
-    name = _controllers(gathered, loop_name)[-1][2]
-    return _design(gathered, loop_name, name, basis(gathered.run.rig, loop_name))
+    title = _in_force(gathered, loop_name)[-1].title
+    return _design(gathered, loop_name, title, basis(gathered.run.rig, loop_name))
 
 
-def _controllers(gathered: Gathered, loop_name: str) -> list[tuple[float, float, str]]:
-    """Begin, end and name of what was in force, from the run's description and its changes."""
-    changes = [
-        (change["time_s"], str(change["source"]), str(change["target"]))
-        for change in gathered.changes
-        if change["loop"] == loop_name
-    ]
-    logged = _logged_design(gathered, loop_name)
+class _InForce(NamedTuple):
+    """A controller while it was in force; from the second learnt one on, their titles have numbers."""
+
+    begin_s: float
+    end_s: float
+    title: str
+    name: str
+    design: str
+
+
+def _in_force(gathered: Gathered, loop_name: str) -> list[_InForce]:
+    """What was in force, in order, from the run's description and its changes."""
+    first = str(gathered.run.metadata.get("designs", {}).get(loop_name) or "")
+    changes = [change for change in gathered.changes if change["loop"] == loop_name]
     vernier = gathered.run.rig.stellar_loops[loop_name].vernier
-    name = changes[0][1] if changes else str(logged.get("name", vernier.controller))
-    begins: list[tuple[float, str]] = [(-math.inf, name)]
-    begins += [(time_s, after) for time_s, _, after in changes]
-    ends = [time_s for time_s, _ in begins[1:]] + [math.inf]
-    return [(begin_s, end_s, its) for (begin_s, its), end_s in zip(begins, ends, strict=True)]
+    logged_name = _parsed(first).get("name", vernier.controller)
+    begins = [(-math.inf, str(changes[0]["source"] if changes else logged_name), first)]
+    begins += [
+        (change["time_s"], str(change["target"]), str(change.get("design_json") or ""))
+        for change in changes
+    ]
+    ends = [begin_s for begin_s, _, _ in begins[1:]] + [math.inf]
+    found, numbers = [], dict[str, int]()
+    for (begin_s, its, design), end_s in zip(begins, ends, strict=True):
+        number = numbers.setdefault(design, len(numbers) + 1) if its == LEARNT else 1
+        title = its if number == 1 else f"{its} ({number})"
+        found.append(_InForce(begin_s, end_s, title, its, design))
+    return found
 
 
 def _within(
@@ -235,10 +249,13 @@ def _predicted(
     return predicted, loop_theory(gathered.run.rig, loop_name, design), ""
 
 
-def _design(gathered: Gathered, loop_name: str, name: str, its_basis: Basis) -> Design:
-    """As it was logged, of several of one name the last; one that was not logged is made again by its name."""
+def _design(gathered: Gathered, loop_name: str, title: str, its_basis: Basis) -> Design:
+    """As it was logged, of several of one title the last; one that was not logged is made again by its name."""
     rig: Rig = gathered.run.rig
-    logged = _logged_design(gathered, loop_name, name)
+    every = _in_force(gathered, loop_name)
+    its = [one for one in every if one.title == title]
+    name = its[-1].name
+    logged = _parsed(next((one.design for one in its[::-1] if one.design), every[0].design))
     if _title(logged) == name:
         design = design_of(logged, gathered.run.logs[-1].path, its_basis, DESIGNS)
         return dataclasses.replace(design, learnt=name == LEARNT)
@@ -248,15 +265,11 @@ def _design(gathered: Gathered, loop_name: str, name: str, its_basis: Basis) -> 
     return design_for(rig, loop_name, name)
 
 
-def _logged_design(gathered: Gathered, loop_name: str, name: str = "") -> dict[str, Any]:
-    """The design with which a loop began, or the last of a name that came later."""
-    text = gathered.run.metadata.get("designs", {}).get(loop_name)
-    for change in gathered.changes:
-        if change["loop"] == loop_name and change["target"] == name:
-            text = change.get("design_json") or text
+def _parsed(text: str) -> dict[str, Any]:
+    """A logged design; empty if it is none that this fitctl wrote."""
     try:
         logged = json.loads(text or "{}", parse_int=float)
-    except (ValueError, RecursionError):  # no design that this fitctl wrote
+    except (ValueError, RecursionError):
         return {}
     return logged if isinstance(logged, dict) else {}
 

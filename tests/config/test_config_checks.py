@@ -24,7 +24,7 @@ def changed(document, changes):
         *path, last = key.split(".")
         table = document
         for part in path:
-            table = table[part]
+            table = table.setdefault(part, {})
         table[last] = value
     return document
 
@@ -242,6 +242,8 @@ CONTRADICTIONS = [
     ({f"{SERVO}.following_error_limit_rad": 0.3}, f"{MOTORS}.velocity_limit_rad_s"),
     ({f"{MOTORS}.velocity_limit_rad_s": 200.0}, f"{SERVO}.following_error_limit_rad"),
     ({f"{SERVO}.reading_timeout_s": 0.001}, f"{SERVO}.rate_hz"),
+    ({"loops.right.star_rate_sky_arcsec_s.el": -1200.0, "loops.right.star_rate_sky_arcsec_s.az": 0.0},
+      f"{MOTORS}.velocity_limit_rad_s"),
     ({f"{MOTORS}.travel_sky_arcsec": 2000.0}, f"{DRIVE}.position_limit_rad"),
     ({f"{DRIVE}.position_limit_rad": 50.0}, f"{MOTORS}.travel_sky_arcsec"),
     ({f"{MOTORS}.spur_gear_ratio": 50.0}, f"{MOTORS}.travel_sky_arcsec"),

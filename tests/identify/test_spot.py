@@ -129,7 +129,7 @@ def test_frames_that_lack_half_of_the_star_s_pixels_do_not_count(rig, tmp_path):
     rows = [row for row in range(14, 27) if row % 3]
     striped = with_bad_pixels(rig, tmp_path, np.ix_(rows, range(14, 27)))
     with pytest.raises(
-        IdentifyError, match=r"0 frames show the star; on \d+ more, half of its pixels"
+        IdentifyError, match=r"0 whole frames show the star; on \d+ more, half of its pixels"
     ):
         spot.analyse(striped, "right", frames(rig, 3.0, count=200))
 
@@ -164,7 +164,7 @@ def test_a_spot_that_is_not_round_is_reported(rig):
 
 
 def test_too_few_frames_are_an_error(rig):
-    with pytest.raises(IdentifyError, match="50 frames show the star; expected at least 100"):
+    with pytest.raises(IdentifyError, match="50 whole frames show the star; expected at least 100"):
         spot.analyse(rig, "right", frames(rig, 3.0, count=50))
 
 

@@ -415,7 +415,8 @@ def test_too_short_a_hold_is_an_error(paper, fixed):
     _, series = held(paper, fixed, 10.0, seed=0)
 
     with pytest.raises(
-        ConfigError, match="longest piece in VERNIER is 10 s; expected at least 20 s"
+        ConfigError,
+        match="longest piece in VERNIER is 10 s, from where it has settled; expected at least 20 s",
     ):
         advise([series], (0.01, 0.01), paper, fixed)
 

@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 from samples.learner_reports import LINE, report
@@ -142,6 +144,29 @@ def test_a_learnt_design_is_judged_as_it_was_logged(rig, tmp_path):
 
     at_hz = found.spectra.frequency_hz
     assert found.predicted.rejection[np.abs(at_hz - LINE.frequency_hz).argmin()] > 2.0
+
+
+@pytest.mark.long
+def test_each_of_several_learnt_designs_is_compared_with_what_it_should_leave(rig, tmp_path):
+    def course(simulation):
+        simulation.acquire()
+        simulation.run(15.0)
+        for frequency_hz in (LINE.frequency_hz, LINE.frequency_hz + 2.0):
+            simulation.command(
+                report(lines=(dataclasses.replace(LINE, frequency_hz=frequency_hz),))
+            )
+            simulation.command(SetController(loop="right", name="learnt"))
+            simulation.run(12.0)
+
+    path = tmp_path / "learnt.mcap"
+    record(with_controller(rig, "right", "eq20"), path, course)
+    loop = find(find_run([path])).loops["right"]
+
+    titles = ["eq20", "learnt", "learnt (2)"]
+    assert [one.controller for one in loop.held_by_controller] == titles
+    assert [one.controller for one in loop.rejections] == titles[1:]  # eq20 was too short
+    first, second = (one.predicted.rejection for one in loop.rejections)
+    assert not np.allclose(first, second, rtol=0.1)
 
 
 def test_a_disturbance_that_cannot_be_designed_for_leaves_the_measurement(held, rig):

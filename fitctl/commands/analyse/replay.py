@@ -20,6 +20,7 @@ from fitctl.config import ConfigError, Rig, load_rig, rig_from_log
 from fitctl.controllers.design.basis import basis
 from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.design.document import MATRICES, design_json
+from fitctl.controllers.pair import Design
 from fitctl.learn.advice import standing
 from fitctl.learn.design_basis import estimated
 from fitctl.logging.reading import LogInfo
@@ -119,7 +120,7 @@ class Left(NamedTuple):
     expected : dict of str to float
         On frames, of the worse axis, with the log's last controller and with the one that was asked for.
     true : dict of str to float
-        Likewise, without the sensor's noise.
+        Likewise, of the star itself: in continuous time, and without the sensor's noise.
     why_not : str
         Why nothing is expected.
     """
@@ -137,8 +138,8 @@ class Left(NamedTuple):
             for name, (az, el) in self.measured.items()
         ]
         lines += [
-            f"loop {self.loop}, RMS expected on the same night with {name}: {px:.4f} px as measured, "
-            f"{self.true[name]:.4f} px without the sensor's noise"
+            f"loop {self.loop}, RMS expected on the same night with {name}: {px:.4f} px on frames, "
+            f"true {self.true[name]:.4f} px"
             for name, px in self.expected.items()
         ]
         if self.why_not:
@@ -159,8 +160,9 @@ def _left(gathered: Gathered, name: str, asked: Rig) -> Left:
         for held in held_by_controller(gathered, name, loop.selection):
             measured[held.controller] = (held.residual["az"].rms, held.residual["el"].rms)
         _, truth, _ = estimated(loop.series, basis(gathered.run.rig, name))
-        designs = (loop.present, design_for(asked, name))
-        found = {design.title: standing(design, truth) for design in designs}
+        design = design_for(asked, name)
+        found = {loop.present.title: standing(loop.present, truth)}
+        found[_asked_title(design)] = standing(design, truth)
     except ConfigError as error:
         return Left(name, measured, {}, {}, str(error))
     return Left(
@@ -169,6 +171,11 @@ def _left(gathered: Gathered, name: str, asked: Rig) -> Left:
         {title: stands.camera_px for title, stands in found.items()},
         {title: stands.residual_px for title, stands in found.items()},
     )
+
+
+def _asked_title(design: Design) -> str:
+    """A saved design goes by the name of its file, as its own name may be that of the log's controller."""
+    return Path(design.file).name if design.file and not design.own else design.title
 
 
 def _rig(
@@ -278,9 +285,12 @@ def _other_designs(info: LogInfo, rig: Rig) -> Iterator[str]:
     """Where the controller to begin with is not that of the log."""
     logged = designs_of(info.metadata)
     for name in [name for name in rig.stellar_loops if name in info.metadata.get("designs", {})]:
-        then, now = logged.get(name, {}), json.loads(design_json(design_for(rig, name)))
-        was = plain(str(then.get("name")))
-        if was != now["name"]:
-            yield f"loop {name} begins with controller {now['name']}, in the log with {was}"
-        elif any(then.get(matrix) != now[matrix] for matrix in MATRICES):
-            yield f"loop {name}: today's design of {now['name']} is not the log's"
+        design = design_for(rig, name)
+        then, now = logged.get(name, {}), json.loads(design_json(design))
+        was, asked = plain(str(then.get("name"))), _asked_title(design)
+        if all(then.get(matrix) == now[matrix] for matrix in MATRICES):
+            continue
+        if was != asked:
+            yield f"loop {name} begins with controller {asked}, in the log with {was}"
+        else:
+            yield f"loop {name}: today's design of {asked} is not the log's"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
+from fitctl.config.base import ARCSEC_PER_RAD
 from fitctl.config.conflict import Conflict, Part, at_least, at_most
 from fitctl.config.loops import Loop
 from fitctl.config.metrology import MetrologyLoop
@@ -21,6 +22,7 @@ def pointing_conflicts(rig: Rig) -> Iterator[Conflict]:
         yield from _confirmation(rig, f"loops.{name}.acquisition", loop)
     for name, loop in rig.stellar_loops.items():
         yield from _light(f"loops.{name}", loop)
+        yield from _star_rate(f"loops.{name}", loop)
         yield from _coarse(rig, f"loops.{name}", loop)
         yield from _designs(rig, f"loops.{name}.vernier", loop)
     for name, metrology in rig.metrology_loops.items():
@@ -66,6 +68,30 @@ def _light(key: str, loop: Loop) -> Iterator[Conflict]:
         yield Conflict(why, (Part(f"{key}.flux_range.low", low, "below 1"),))
     if high <= 1:
         yield Conflict(why, (Part(f"{key}.flux_range.high", high, "above 1"),))
+
+
+def _star_rate(key: str, loop: Loop) -> Iterator[Conflict]:
+    """A star that moves by itself needs motors as quick as it is."""
+    rate, siderostat = loop.star_rate_sky_arcsec_s, loop.siderostat
+    if rate is None:
+        return
+    # On the sky, by a radian of motor.
+    motor_arcsec = siderostat.sky_rad_per_motor_rad * ARCSEC_PER_RAD
+    needed_rad_s = max(abs(rate.az), abs(rate.el)) / motor_arcsec
+    limit_rad_s = siderostat.velocity_limit_rad_s
+    if needed_rad_s > limit_rad_s:
+        most_arcsec_s = limit_rad_s * motor_arcsec
+        which = "az" if abs(rate.az) >= abs(rate.el) else "el"
+        arcsec_s = getattr(rate, which)
+        whole = math.floor(most_arcsec_s)
+        must_be = f"at most {whole}" if arcsec_s > 0 else f"at least {-whole}"
+        yield Conflict(
+            f"the siderostat cannot follow so fast a star: its motors reach {whole} arcsec/s",
+            (
+                Part(f"{key}.star_rate_sky_arcsec_s.{which}", arcsec_s, must_be),
+                at_least(f"{key}.siderostat.velocity_limit_rad_s", limit_rad_s, needed_rad_s),
+            ),
+        )
 
 
 def _coarse(rig: Rig, key: str, loop: Loop) -> Iterator[Conflict]:

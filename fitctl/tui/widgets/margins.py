@@ -179,11 +179,24 @@ def learning_lines(loop: LoopState, columns: int) -> list[Line]:
         lines.append([text("before".ljust(_NAME_COLUMNS), DIM), text(before, INK)])
     if learning.state == "advice":
         command = f"fitctl send controller learnt --loop {loop.name}"
-        lines.append([text("to apply".ljust(_NAME_COLUMNS), DIM), text(command, INK)])
-    if learning.text:
-        night = shorten(learning.text, columns - _NAME_COLUMNS)
-        lines.append([text("night".ljust(_NAME_COLUMNS), DIM), text(night, DIM)])
-    return lines
+        lines += _wrapped("to apply", command, INK, columns)
+    return lines + _wrapped("night", learning.text, DIM, columns)
+
+
+def _wrapped(name: str, said: str, colour: str, columns: int) -> list[Line]:
+    """A text over as many rows as it needs, up to four; no row without one."""
+    rows = textwrap.wrap(
+        said,
+        max(10, columns - _NAME_COLUMNS),
+        max_lines=4,
+        placeholder="…",
+        break_on_hyphens=False,
+    )
+    names = [name, *[""] * 3]
+    return [
+        [text(its_name.ljust(_NAME_COLUMNS), DIM), text(row, colour)]
+        for its_name, row in zip(names, rows, strict=False)
+    ]
 
 
 def _figure(name: str, value: float, unit: str, form: str = ".2f") -> Line:

@@ -9,6 +9,8 @@ from samples.log_samples import RUN_INFO, tick, write_log
 
 from fitctl.cli import main
 from fitctl.config import default_rig_path, load_rig
+from fitctl.controllers.design.choose import design_for
+from fitctl.controllers.design.files import save_design
 from fitctl.controllers.prefilter import Prefilter
 from fitctl.messages.commands import SetController
 from tests.samples.logged_simulation import LoggedSimulation
@@ -108,6 +110,18 @@ def test_the_rms_of_each_controller_and_of_the_wanted_one(replay, changed_log):
     left_px = max(loop["measured"]["minimum-variance"])
     assert loop["expected"]["minimum-variance"] == pytest.approx(left_px, rel=0.2)
     assert loop["true"]["minimum-variance"] < loop["true"]["lqg-ltr"] < loop["expected"]["lqg-ltr"]
+
+
+@pytest.mark.long
+def test_a_saved_design_goes_by_the_name_of_its_file(replay, changed_log, tmp_path):
+    file = tmp_path / "mine.json"
+    save_design(design_for(load_rig(default_rig_path()), "right", "fslq"), file)
+    status, text, _ = replay(changed_log, "--controller", file)
+
+    assert status == 0
+    assert "expected on the same night with minimum-variance: " in text
+    assert "expected on the same night with mine.json: " in text
+    assert "begins with controller mine.json, in the log with eq20" in text
 
 
 def test_a_run_that_differs_without_a_change_has_status_1(replay, log, monkeypatch):
