@@ -13,7 +13,7 @@ class Pace:
     """Lets drawing wait while more processor time was used than `SHARE` of the time gone by.
 
     So a terminal of any size leaves the machine to the loop; a large one is drawn less often, but never
-    less than about once in `LONGEST_S`.
+    less than about once in `LONGEST_S`, also where reading the telemetry alone takes the whole share.
 
     Parameters
     ----------
@@ -31,11 +31,15 @@ class Pace:
         self._at_s = clock()
         self._used_s = processor()
         self._owed_s = 0.0
+        self._drawn_s = self._at_s
 
     def due(self) -> bool:
-        """Whether something may be drawn now."""
+        """Whether something may be drawn now; the caller then draws."""
         now_s, used_s = self._clock(), self._processor()
         self._owed_s += used_s - self._used_s - SHARE * (now_s - self._at_s)
         self._owed_s = min(max(self._owed_s, 0.0), SHARE * LONGEST_S)
         self._at_s, self._used_s = now_s, used_s
-        return self._owed_s <= 0.0
+        is_due = self._owed_s <= 0.0 or now_s - self._drawn_s >= LONGEST_S
+        if is_due:
+            self._drawn_s = now_s
+        return is_due
