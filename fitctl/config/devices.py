@@ -305,9 +305,14 @@ class Siderostat(Settings, Generic[AmplifierDevice]):
         return 2 * self.ball_screw_m_per_rad / self.spur_gear_ratio / self.lever_arm_m
 
     @property
+    def sky_arcsec_per_motor_rad(self) -> float:
+        """The same in arcsec."""
+        return self.sky_rad_per_motor_rad * ARCSEC_PER_RAD
+
+    @property
     def travel_rad(self) -> float:
         """Travel of the motors, either way from the encoders' zero."""
-        return self.travel_sky_arcsec / (self.sky_rad_per_motor_rad * ARCSEC_PER_RAD)
+        return self.travel_sky_arcsec / self.sky_arcsec_per_motor_rad
 
 
 AnySiderostat = Siderostat[SiderostatDevice]

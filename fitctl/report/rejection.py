@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -122,24 +122,24 @@ def held_by_controller(gathered: Gathered, loop_name: str, selection: Selection)
     ticks = gathered.ticks[loop_name]
     error_px = axis_pair(ticks, "error_{}_px")
     found = []
-    for name, spans in _spans(gathered, loop_name).items():
-        pieces = _within(selection, ticks, spans)
+    for title, its in _by_title(gathered, loop_name).items():
+        pieces = _within(selection, ticks, its)
         if not pieces:
             continue
         rows = np.concatenate(pieces)
         residual = {
             axis: rms_estimate(error_px[rows, column]) for column, axis in enumerate(("az", "el"))
         }
-        found.append(Held(name, len(rows) * gathered.run.rig.camera.period_s, residual))
+        found.append(Held(title, len(rows) * gathered.run.rig.camera.period_s, residual))
     return found
 
 
-def _spans(gathered: Gathered, loop_name: str) -> dict[str, list[tuple[float, float]]]:
-    """From when to when each controller was in force."""
-    spans: dict[str, list[tuple[float, float]]] = {}
+def _by_title(gathered: Gathered, loop_name: str) -> dict[str, list[_InForce]]:
+    """When each controller was in force, in the order of their first use."""
+    found: dict[str, list[_InForce]] = {}
     for one in _in_force(gathered, loop_name):
-        spans.setdefault(one.title, []).append((one.begin_s, one.end_s))
-    return spans
+        found.setdefault(one.title, []).append(one)
+    return found
 
 
 def rejections(gathered: Gathered, loop_name: str, selection: Selection) -> list[Rejection]:
@@ -153,9 +153,9 @@ def rejections(gathered: Gathered, loop_name: str, selection: Selection) -> list
     disturbance_px = error_px - stages_px(rig, loop_name, ticks)
     period_s = rig.camera.period_s
     found = []
-    for name, spans in _spans(gathered, loop_name).items():
+    for title, its in _by_title(gathered, loop_name).items():
         its_spectra, segments, seconds = [], [], 0.0
-        pieces = _within(selection, ticks, spans)
+        pieces = _within(selection, ticks, its)
         for piece in pieces:
             time_s = ticks["mid_exposure_s"][piece]
             if time_s[-1] - time_s[0] < SEGMENT_S:
@@ -169,13 +169,13 @@ def rejections(gathered: Gathered, loop_name: str, selection: Selection) -> list
         if its_spectra:
             # Not at rest, where the siderostat integrates and a logarithm ends.
             measured = Spectra(*(of[1:] for of in mean_spectra(its_spectra, segments)))
-            predicted, theory, why = _predicted(gathered, loop_name, name, measured.frequency_hz)
+            predicted, theory, why = _predicted(gathered, loop_name, its, measured.frequency_hz)
             its_budget = (
                 None
                 if theory is None
                 else budget(theory, ticks, motion(theory, ticks, mirror_rad), pieces)
             )
-            found.append(Rejection(name, seconds, measured, predicted, why, its_budget))
+            found.append(Rejection(title, seconds, measured, predicted, why, its_budget))
     return found
 
 
@@ -187,8 +187,9 @@ def last_design(gathered: Gathered, loop_name: str) -> Design:
     ConfigError
         If its matrices are not in the log and cannot be made again.
     """
-    title = _in_force(gathered, loop_name)[-1].title
-    return _design(gathered, loop_name, title, basis(gathered.run.rig, loop_name))
+    every = _in_force(gathered, loop_name)
+    its = [one for one in every if one.title == every[-1].title]
+    return _design(gathered, loop_name, its, basis(gathered.run.rig, loop_name))
 
 
 class _InForce(NamedTuple):
@@ -203,7 +204,7 @@ class _InForce(NamedTuple):
 
 def _in_force(gathered: Gathered, loop_name: str) -> list[_InForce]:
     """What was in force, in order, from the run's description and its changes."""
-    first = str(gathered.run.metadata.get("designs", {}).get(loop_name) or "")
+    first = _first_design(gathered, loop_name)
     changes = [change for change in gathered.changes if change["loop"] == loop_name]
     vernier = gathered.run.rig.stellar_loops[loop_name].vernier
     logged_name = _parsed(first).get("name", vernier.controller)
@@ -222,24 +223,24 @@ def _in_force(gathered: Gathered, loop_name: str) -> list[_InForce]:
 
 
 def _within(
-    selection: Selection, ticks: Columns, spans: list[tuple[float, float]]
+    selection: Selection, ticks: Columns, its: Iterable[_InForce]
 ) -> list[NDArray[np.intp]]:
     pieces = []
     for piece in selection.pieces:
         time_s = ticks["time_s"][piece]
-        for begin_s, end_s in spans:
-            inside = piece[(time_s >= begin_s) & (time_s < end_s)]
+        for one in its:
+            inside = piece[(time_s >= one.begin_s) & (time_s < one.end_s)]
             if len(inside) > 1:
                 pieces.append(inside)
     return pieces
 
 
 def _predicted(
-    gathered: Gathered, loop_name: str, name: str, frequency_hz: Floats
+    gathered: Gathered, loop_name: str, its: Sequence[_InForce], frequency_hz: Floats
 ) -> tuple[Predicted | None, LoopTheory | None, str]:
     try:
         its_basis = basis(gathered.run.rig, loop_name)
-        design = _design(gathered, loop_name, name, its_basis)
+        design = _design(gathered, loop_name, its, its_basis)
         its_basis = night_of(design, its_basis)
     except ConfigError as error:
         return None, None, str(error)
@@ -249,13 +250,18 @@ def _predicted(
     return predicted, loop_theory(gathered.run.rig, loop_name, design), ""
 
 
-def _design(gathered: Gathered, loop_name: str, title: str, its_basis: Basis) -> Design:
+def _first_design(gathered: Gathered, loop_name: str) -> str:
+    """The design with which a loop began, as it was logged."""
+    return str(gathered.run.metadata.get("designs", {}).get(loop_name) or "")
+
+
+def _design(
+    gathered: Gathered, loop_name: str, its: Sequence[_InForce], its_basis: Basis
+) -> Design:
     """As it was logged, of several of one title the last; one that was not logged is made again by its name."""
     rig: Rig = gathered.run.rig
-    every = _in_force(gathered, loop_name)
-    its = [one for one in every if one.title == title]
-    name = its[-1].name
-    logged = _parsed(next((one.design for one in its[::-1] if one.design), every[0].design))
+    name, first = its[-1].name, _first_design(gathered, loop_name)
+    logged = _parsed(next((one.design for one in reversed(its) if one.design), first))
     if _title(logged) == name:
         design = design_of(logged, gathered.run.logs[-1].path, its_basis, DESIGNS)
         return dataclasses.replace(design, learnt=name == LEARNT)

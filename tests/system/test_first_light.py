@@ -104,9 +104,8 @@ def test_the_mocks_have_the_night_that_the_rig_file_describes(tmp_path, sockets)
         np.median(ticks["star_sigma_az_px"][held][(time_s > from_s) & (time_s < to_s)])
         for from_s, to_s in ((20.0, 27.0), (36.0, 44.0))
     )
-    assert (
-        2.0 < after_px / before_px < 3.0
-    )  # three times the noise of a pixel; that of the light stays
+    # A pixel has three times the noise, and the light as much as before.
+    assert 2.0 < after_px / before_px < 3.0
 
 
 @pytest.mark.slow

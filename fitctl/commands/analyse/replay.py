@@ -174,7 +174,7 @@ def _left(gathered: Gathered, name: str, asked: Rig) -> Left:
 
 
 def _asked_title(design: Design) -> str:
-    """A saved design goes by the name of its file, as its own name may be that of the log's controller."""
+    """Of a saved design the name of its file: the log's controller may have the design's own name."""
     return Path(design.file).name if design.file and not design.own else design.title
 
 

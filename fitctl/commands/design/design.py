@@ -41,9 +41,7 @@ from fitctl.model.optics import scales
 
 _RECOVERY_WEIGHTS = (1e-5, 1e-6, 1e-7, 1e-8, 0.5e-9, 1e-11)
 _COARSE_GAINS_HZ = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0)
-_OTHER_NOISE = (
-    0.1  # part by which a saved design's noise may differ from the sensor's without a remark
-)
+_OTHER_NOISE = 0.1  # so much may a saved design's noise differ from the sensor's, in parts of that
 _SINE = 1e-4  # damping of a line that has none: a design can then follow it as well
 _ACROSS = 1e-6  # a line across an axis has no more of its RMS along it
 _MARGIN_AMPLITUDES = (1.05, 1.2, 2.0, 10.0)
@@ -322,8 +320,9 @@ def _saved(file: str) -> Callable[[Rig, str], Report]:
     def report(rig: Rig, loop: str) -> Report:
         design = design_for(rig, loop, file)
         title = LEARNT if design.learnt else f"{design.name} of {file}"
-        result, lines = _stands(title, design, night_of(design, basis(rig, loop)), rig, loop)
-        made_px, sensor_px = design.parameters.get("noise_px"), basis(rig, loop).noise_px
+        its_basis = basis(rig, loop)
+        result, lines = _stands(title, design, night_of(design, its_basis), rig, loop)
+        made_px, sensor_px = design.parameters.get("noise_px"), its_basis.noise_px
         if made_px and not design.learnt and abs(made_px / sensor_px - 1) > _OTHER_NOISE:
             lines.append(
                 f"  it was made for {made_px:.4f} px of noise; the sensor of this rig file has {sensor_px:.4f}"

@@ -192,14 +192,16 @@ def _common_scale(site: Site, scale: float) -> dict[str, Any]:
         return {}
     siderostat = site.loop.siderostat
     focal_m = site.rig.optics.focal_length_m * scale
-    back: dict[str, Any] = {
-        "spur_gear_ratio": round(siderostat.spur_gear_ratio * before, 2),
-        "travel_sky_arcsec": round(siderostat.travel_sky_arcsec / min(before, 1.0), 1),
-    }
-    uneven = figures.get(f"{site.name}.siderostat.uneven{BEFORE}", 1.0)
-    if uneven > EVEN:  # its step has put the scale into the gains
+    back: dict[str, Any]
+    # Where the axes were uneven, the siderostat's step has put the scale into the gains.
+    if figures.get(f"{site.name}.siderostat.uneven{BEFORE}", 1.0) > EVEN:
         turn = stage_turn(siderostat.rotation_deg, siderostat.axis_gains)
         back = {"axis_gains": gains_of(turn / before, siderostat.rotation_deg)}
+    else:
+        back = {
+            "spur_gear_ratio": round(siderostat.spur_gear_ratio * before, 2),
+            "travel_sky_arcsec": round(siderostat.travel_sky_arcsec / min(before, 1.0), 1),
+        }
     return {"optics": {"focal_length_m": round(focal_m, 4)}} | site.found(siderostat=back)
 
 

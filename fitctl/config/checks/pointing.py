@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from fitctl.config.base import ARCSEC_PER_RAD
 from fitctl.config.conflict import Conflict, Part, at_least, at_most
 from fitctl.config.loops import Loop
 from fitctl.config.metrology import MetrologyLoop
@@ -75,15 +74,12 @@ def _star_rate(key: str, loop: Loop) -> Iterator[Conflict]:
     rate, siderostat = loop.star_rate_sky_arcsec_s, loop.siderostat
     if rate is None:
         return
-    # On the sky, by a radian of motor.
-    motor_arcsec = siderostat.sky_rad_per_motor_rad * ARCSEC_PER_RAD
-    needed_rad_s = max(abs(rate.az), abs(rate.el)) / motor_arcsec
+    which = "az" if abs(rate.az) >= abs(rate.el) else "el"
+    arcsec_s = getattr(rate, which)
+    needed_rad_s = abs(arcsec_s) / siderostat.sky_arcsec_per_motor_rad
     limit_rad_s = siderostat.velocity_limit_rad_s
     if needed_rad_s > limit_rad_s:
-        most_arcsec_s = limit_rad_s * motor_arcsec
-        which = "az" if abs(rate.az) >= abs(rate.el) else "el"
-        arcsec_s = getattr(rate, which)
-        whole = math.floor(most_arcsec_s)
+        whole = math.floor(limit_rad_s * siderostat.sky_arcsec_per_motor_rad)
         must_be = f"at most {whole}" if arcsec_s > 0 else f"at least {-whole}"
         yield Conflict(
             f"the siderostat cannot follow so fast a star: its motors reach {whole} arcsec/s",

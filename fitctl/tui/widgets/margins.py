@@ -185,17 +185,11 @@ def learning_lines(loop: LoopState, columns: int) -> list[Line]:
 
 def _wrapped(name: str, said: str, colour: str, columns: int) -> list[Line]:
     """A text over as many rows as it needs, up to four; no row without one."""
-    rows = textwrap.wrap(
-        said,
-        max(10, columns - _NAME_COLUMNS),
-        max_lines=4,
-        placeholder="…",
-        break_on_hyphens=False,
-    )
-    names = [name, *[""] * 3]
+    room = max(10, columns - _NAME_COLUMNS)
+    pieces = textwrap.wrap(said, room, max_lines=4, placeholder="…", break_on_hyphens=False)
     return [
-        [text(its_name.ljust(_NAME_COLUMNS), DIM), text(row, colour)]
-        for its_name, row in zip(names, rows, strict=False)
+        [text((name if number_ == 0 else "").ljust(_NAME_COLUMNS), DIM), text(piece, colour)]
+        for number_, piece in enumerate(pieces)
     ]
 
 
