@@ -10,6 +10,15 @@ from benchmarks.swarm.invariants import ANSWERED_ONCE, Invariants
 from benchmarks.swarm.service import SwarmService
 from benchmarks.swarm.threads import VirtualEvent, VirtualTime
 from fitctl.config import Rig
+from fitctl.logging.records import (
+    AnyRecord,
+    Event,
+    LoopTiming,
+    MetrologyTick,
+    ModeChange,
+    PiezoReading,
+    Tick,
+)
 from fitctl.messages.commands import AnyCommand, Reply
 from fitctl.messages.telemetry import Telemetry
 from fitctl.sequences import steps
@@ -18,7 +27,7 @@ from fitctl.sequences.runner import Runner, run_steps
 from fitctl.sequences.view import SequenceError
 from fitctl.service.admission import Sender
 from fitctl.supervisor.supervisor import Supervisor
-from fitctl.tui.state import ConsoleState
+from fitctl.tui.state import ConsoleState, LoopView
 
 _VISIT: dict[str, Any] = {"dwell_s": 8.0, "steady_after_s": 5.0}
 _STARS = [
@@ -94,9 +103,20 @@ class Console:
         if supervisor is None or service is None:
             return
         for name, loop in supervisor.loops.items():
-            shown = state.loops[name].state
+            view = state.loops[name]
+            shown = view.state
             if shown.mode != loop.mode.name or shown.since_s != loop.mode_since_s:
                 self._wrong(f"{name}: shows {shown.mode}, is {loop.mode.name}")
+            self._shows_newest(name, view, service.newest, lossless=not self._loss)
+        newest_event = next(iter(state.events), None)
+        if message.events and newest_event is not service.newest.get((Event, "")):
+            self._wrong(f"its newest event is {newest_event}")
+        collector = None if supervisor.collector is None else supervisor.collector.state
+        if message.collector != collector:
+            self._wrong(f"the collector: shows {message.collector}, is {collector}")
+        sequence = supervisor.sequences.status()
+        if message.running_sequence != sequence:
+            self._wrong(f"a sequence: shows {message.running_sequence}, is {sequence}")
         if state.missed != self._missed:
             self._wrong(f"{self._missed} messages missed, {state.missed} counted")
         losses = message.losses
@@ -104,6 +124,32 @@ class Console:
             self._missed or self._loss or losses.events_unsent or self._heard == service.events
         ):
             self._wrong(f"{service.events} events, {self._heard} heard, none missed")
+
+    def _shows_newest(
+        self,
+        name: str,
+        view: LoopView,
+        newest: dict[tuple[type, str], AnyRecord],
+        *,
+        lossless: bool,
+    ) -> None:
+        """What it shows of a loop is what the supervisor recorded last; ticks are sent only once."""
+        shown: dict[type, Any] = {
+            ModeChange: view.change,
+            LoopTiming: view.timing,
+            PiezoReading: view.piezo,
+        }
+        if lossless:
+            shown |= {Tick: view.tick, MetrologyTick: view.beam}
+        for kind, record in shown.items():
+            recorded = newest.get((kind, name))
+            if recorded is not None and record is not recorded and record != recorded:
+                self._wrong(f"{name}: shows {record}, recorded is {recorded}")
+        recorded = newest.get((Tick, name)) or newest.get((MetrologyTick, name))
+        if lossless and recorded is not None and view.past.newest_s != recorded.time_s:
+            self._wrong(
+                f"{name}: its traces end at {view.past.newest_s} s, not {recorded.time_s} s"
+            )
 
     def _wrong(self, detail: str) -> None:
         self._invariants.violated("the console shows what is", detail)

@@ -205,6 +205,7 @@ class Invariants:
         self._zeros_lost_rad: dict[str, float] = {}  # by loop: nobody has read the encoders since
         self._zeros_read_rad: dict[str, float] = {}  # by loop: read, in an opening that goes on
         self._zeros_noticed_s: dict[str, float] = {}
+        self._misread: set[str] = set()  # loops whose encoders may have been read wrongly
         self._checked_s: dict[str, float] = {}  # by loop: when the swarm last checked its star
         self._wrong_since_s: dict[str, float] = {}  # by loop: since when it follows another star
         self._pointed_at: set[str] = set()  # a person said which star these loops follow
@@ -273,6 +274,10 @@ class Invariants:
         if self._supervisor is not None:
             position_rad = float(np.abs(self._supervisor.loops[name].servo.position_rad).max())
         self._zeros_lost_rad[name] = max(position_rad, self._zeros_lost_rad.get(name, 0.0))
+
+    def encoder_wrong(self, name: str) -> None:
+        """An encoder of a loop reads wrong angles from now on."""
+        self._misread.add(name)
 
     def encoders_read(self, name: str) -> None:
         """A loop's encoders are read for the first time since its amplifiers were opened."""
@@ -396,6 +401,12 @@ class Invariants:
         lost_rad = self._zeros_read_rad.pop(name, None)
         if lost_rad is not None:
             self._zeros_noticed_s[name] = self._clock.now_s()
+        if (
+            name in self._misread
+        ):  # this opening's reading, or the last before it, may have been wrong
+            if not self._lines[f"{name} siderostat"].was_wrong("encoder", _MOST_WRONG_S):
+                self._misread.discard(name)
+            return
         if opened.encoders_jumped and lost_rad is None and not self._reads_zero(name):
             self.violated("encoders that count on keep the star's place", name)
         is_far = lost_rad is not None and lost_rad > _JUMP_RAD and name in self._opened
@@ -469,10 +480,11 @@ class Invariants:
             self.violated("without a fault nothing fails", f"{name}: {change.reason}")
 
     def _was_stuck(self, name: str) -> bool:
-        """Its motors do not move, or did not until recently, or did not before a stall that ended recently."""
+        """Its motors do not move or an encoder is wrong, or that was so recently, or before a recent stall."""
         stalled = self._clock.now_s() - self._stall_ended_s < _STUCK_S
         within_s = _MOST_WRONG_S if stalled else _STUCK_S
-        return self._lines[f"{name} siderostat"].was_wrong("stuck", within_s)
+        line = self._lines[f"{name} siderostat"]
+        return any(line.was_wrong(fault, within_s) for fault in ("stuck", "encoder"))
 
     def _reported(self, event: Event) -> None:
         if event.severity == "error" and event.source in self._rig.loops:
@@ -517,6 +529,8 @@ class Invariants:
 
     def _within_travel(self, name: str, velocity_rad_s: AzEl) -> None:
         """No motor that is beyond the travel, by the drive's count, is driven farther out."""
+        if self._lines[f"{name} siderostat"].was_wrong("encoder", _STUCK_S):
+            return
         most_rad = self._travel_rad[name] + self._coasts_rad[name]
         hardly_rad_s = _HARDLY * self._most_rad_s[name]
         motors_rad = self._plant.loops[name].state.motor_rad[0].tolist()

@@ -26,7 +26,7 @@ FAULTS = ("slow", "deaf", "mute", "refuses", "garbled", "unplugged")
 """Faults of a line, in this order: late answers, lost requests, lost answers, a device that refuses,
 answers that make no sense, and a cable that is unplugged."""
 WRONG: dict[str, tuple[str, ...]] = {
-    "siderostat": ("trip", "stuck"),
+    "siderostat": ("trip", "stuck", "encoder"),
     "D/A": ("tripped",),
     "piezo": ("stuck", "limit"),
     "camera": ("frozen", "drops", "saturated"),
@@ -35,21 +35,54 @@ WRONG: dict[str, tuple[str, ...]] = {
 }
 """Faults of a device whose line is well, by kind of device.
 
-Amplifiers detect a fault of their own, or motors do not move. A D/A's watchdog has tripped: its outputs are at
-their safe voltages, and it refuses every request. A stack has the highest voltage, or the limit switch is at
-another voltage. The camera repeats an image, loses half of its frames, or has all pixels at full scale.
-Photodiodes are at the end of their range. The hexapod reports a wrong pose, accepts moves and does not move, or
-its servos are off.
+Amplifiers detect a fault of their own, motors do not move, or an encoder reads a wrong angle. A D/A's watchdog
+has tripped: its outputs are at their safe voltages, and it refuses every request. A stack has the highest
+voltage, or the limit switch is at another voltage. The camera repeats an image, loses half of its frames, or
+has all pixels at full scale. Photodiodes are at the end of their range. The hexapod reports a wrong pose,
+accepts moves and does not move, or its servos are off.
 """
 SILENCE = frozenset(FAULTS) - {"slow"}
 """Faults during which no answer arrives that makes sense."""
 OF_SOME_CALLS = (
     *(fault for fault in FAULTS if fault != "unplugged"),
+    "encoder",
     "limit",
     "saturated",
     "offset",
 )
 """Faults that may meet only some of the calls: those of lines, and single wrong values."""
+
+
+class SomeCalls:
+    """Which calls a fault meets that does not meet each: a fraction of them, or a single one.
+
+    Parameters
+    ----------
+    random : Random
+    part : float
+        Fraction of the calls, drawn for each.
+    number : int
+        If not 0, only this call is met, counted from 1.
+    size : float
+        As of a fault that meets each call.
+    """
+
+    def __init__(self, random: Random, part: float, number: int, size: float) -> None:
+        self.size = size
+        self._random = random
+        self._part = part
+        self._number = number
+        self._calls = 0
+
+    @property
+    def is_seldom(self) -> bool:
+        """A device is heard soon enough that fails only in so few calls."""
+        return self._number > 0 or self._part <= _SELDOM
+
+    def meets_next(self) -> bool:
+        """Whether the next call is met."""
+        self._calls += 1
+        return self._calls == self._number if self._number else self._random.random() < self._part
 
 
 class Bus:
@@ -91,10 +124,11 @@ class Line:
     ----------
     faults : dict of str to float
         The faults in force, from `FAULTS`. The value of "slow" is the factor.
-    at_times : dict of str to (float, float)
-        Those of `OF_SOME_CALLS` that meet only a fraction of the calls, and the value as in `faults`.
+    at_times : dict of str to SomeCalls
+        Those of `OF_SOME_CALLS` that meet only some calls.
     wrong : dict of str to float
-        The faults in force, from `WRONG`. The value of "stuck" of a piezo amplifier is the stack.
+        The faults in force, from `WRONG`. The value of "stuck" of a piezo amplifier is the stack, that of
+        "encoder" the angle in rad.
     wrong_until_s : dict of str to float
         When each of those ended last.
     healed_s : float
@@ -119,7 +153,7 @@ class Line:
         self.device = device
         self.endpoint = endpoint
         self.faults: dict[str, float] = {}
-        self.at_times: dict[str, tuple[float, float]] = {}
+        self.at_times: dict[str, SomeCalls] = {}
         self.wrong: dict[str, float] = {}
         self.wrong_until_s: dict[str, float] = {}
         self.healed_s = self.answered_s = -math.inf
@@ -131,11 +165,16 @@ class Line:
         self._usual_s = usual_s
         self._until_s: dict[tuple[str, bool], float] = {}  # by fault, and whether of some calls
 
-    def begin(self, fault: str, lasts_s: float, size: float = 0.0, part: float = 1.0) -> None:
-        """Let a fault be in force for a time; one of the same kind that lasts longer is not cut short."""
-        at_times = part < 1.0 and fault in OF_SOME_CALLS
+    def begin(
+        self, fault: str, lasts_s: float, size: float = 0.0, part: float = 1.0, number: int = 0
+    ) -> None:
+        """Let a fault be in force for a time; one of the same kind that lasts longer is not cut short.
+
+        It meets each call, a `part` of them, or only the one with this `number`.
+        """
+        at_times = (part < 1.0 or number > 0) and fault in OF_SOME_CALLS
         if at_times:
-            self.at_times[fault] = part, size
+            self.at_times[fault] = SomeCalls(self._random, part, number, size)
         elif fault in FAULTS:
             self.faults[fault] = size
         else:
@@ -152,6 +191,8 @@ class Line:
         if at_times:
             self.at_times.pop(fault, None)
             self.healed_s = self._time.now_s()
+            if fault not in FAULTS:
+                self.wrong_until_s[fault] = self.healed_s
         else:
             self.heal(fault)
 
@@ -159,6 +200,7 @@ class Line:
         """End these faults, or all of them, also of some calls, if none is named."""
         self.healed_s = self._time.now_s()
         if not faults:
+            self.wrong_until_s |= dict.fromkeys(self.at_times.keys() - set(FAULTS), self.healed_s)
             self.at_times.clear()
         for fault in faults or [*self.faults, *self.wrong]:
             self.faults.pop(fault, None)
@@ -168,9 +210,10 @@ class Line:
             self.answered_s = self.healed_s
 
     def was_wrong(self, fault: str, within_s: float) -> bool:
-        """A fault from `WRONG` is in force, or was until recently."""
+        """A fault from `WRONG` is in force, at least for some calls, or was until recently."""
         until_s = self.wrong_until_s.get(fault, -math.inf)
-        return fault in self.wrong or self._time.now_s() - until_s < within_s
+        in_force = fault in self.wrong or fault in self.at_times
+        return in_force or self._time.now_s() - until_s < within_s
 
     @property
     def is_bad(self) -> bool:
@@ -180,26 +223,30 @@ class Line:
     @property
     def is_readable(self) -> bool:
         """Answers arrive in time, at least most of them."""
-        seldom = any(part > _SELDOM for part, _ in self.at_times.values())
-        return self.connected and not (self.faults or seldom)
+        seldom = all(calls.is_seldom for calls in self.at_times.values())
+        return self.connected and seldom and not self.faults
 
     def of_this_call(self) -> dict[str, float]:
-        """The faults of one call: those in force, and, drawn, those that meet only some calls."""
+        """The faults of one call: those in force, and those that meet it and not each."""
         if not self.at_times:
             return self.faults
         drawn = {
-            fault: size
-            for fault, (part, size) in self.at_times.items()
-            if fault in FAULTS and self._random.random() < part
+            fault: calls.size
+            for fault, calls in self.at_times.items()
+            if fault in FAULTS and calls.meets_next()
         }
         return self.faults | drawn
 
-    def is_wrong(self, fault: str) -> bool:
-        """Whether the value of one call is wrong in this way: always meanwhile, or, drawn, at times."""
+    def wrong_by(self, fault: str) -> float | None:
+        """The value of a fault from `WRONG` if the value of one call is wrong in this way, or None."""
         if fault in self.wrong:
-            return True
-        part, _ = self.at_times.get(fault, (0.0, 0.0))
-        return part > 0.0 and self._random.random() < part
+            return self.wrong[fault]
+        calls = self.at_times.get(fault)
+        return calls.size if calls is not None and calls.meets_next() else None
+
+    def is_wrong(self, fault: str) -> bool:
+        """Whether the value of one call is wrong in this way."""
+        return self.wrong_by(fault) is not None
 
     @property
     def is_silent(self) -> bool:
@@ -262,7 +309,7 @@ class Line:
             raise self.timeout()
         if "refuses" in faults:
             self._sleep(min(delay_s / 2, self.timeout_s))
-            raise DeviceRefused(self.device, self.endpoint, "to obey", "a refusal", "ask it why")
+            raise self.refused()
         result = act()
         if "mute" in faults or delay_s > self.timeout_s:
             self._sleep_until(began_s + self.timeout_s)
@@ -293,6 +340,10 @@ class Line:
         return DeviceTimeout(
             self.device, self.endpoint, f"an answer within {self.timeout_s:g} s", "none", "check it"
         )
+
+    def refused(self) -> DeviceRefused:
+        """The error for a device that will not obey."""
+        return DeviceRefused(self.device, self.endpoint, "to obey", "a refusal", "ask it why")
 
     def garbled(self) -> DeviceProtocolError:
         """The error for an answer that makes no sense; it also closes the line."""

@@ -63,11 +63,16 @@ _OF_TESTBED = (
 # Fraction of commands that are repeated, drawn for each run, and the mean delay: a key held down.
 _REPEATED, _REPEATED_S = (0.0, 0.1, 0.6), 0.02
 _PLACES, _FEW_PLACES = 3, 0.5  # fraction of runs whose targets are only so many places
-_SLOW_SLEW = 0.4  # fraction of interrupted slews on a slow line
+_SLOW_SLEW = 0.4  # fraction of interrupted slews on a slow line,
+_BRIEFLY = 0.5  # and of these, fraction of lines that are slow for a moment
+_KILLED_SEARCHES = 0.1  # fraction of runs with searches in which the supervisor is killed
+_HELD_S, _HIDDEN_S = (10.0, 40.0), (30.0, 80.0)  # when clouds come then, and how long they last
 _SLEW_S = 1.5  # a slew is interrupted within this time of its beginning,
 _MEETS_S = 0.1  # and a stall follows within this
 _WRONG = 0.25  # fraction of strikes with wrong values, on devices that can have some
 _AT_TIMES, _LASTS_LONGER = 0.3, 5.0  # fraction of faults that meet only some calls, and last longer
+_ONCE, _LAST_CALL = 0.3, 40  # fraction of these that meet a single call, one of the next so many
+_WRONG_RAD = -1.5, 0.7  # powers of ten of what an encoder is wrong by
 _AT_ONCE_S = 0.004  # mean delay between hurried commands
 _LONG_STALL, _SILENT = 0.3, 0.5  # fractions of disturbed rests
 _LEARNER, _LEARNS = 0.4, 0.5  # fraction of runs with a learner, and of these, with `learn = "on"`
@@ -111,7 +116,7 @@ class Order(_Happening, frozen=True, kw_only=True, tag="order"):
 class Strike(_Happening, frozen=True, kw_only=True, tag="strike"):
     """A fault of one device, and how long it lasts; what happens at once has no duration.
 
-    `part` is the fraction of the calls that it meets.
+    `part` is the fraction of the calls that it meets; with a `number` it meets only that call, counted from 1.
     """
 
     device: str
@@ -119,12 +124,13 @@ class Strike(_Happening, frozen=True, kw_only=True, tag="strike"):
     lasts_s: float = 0.0
     size: float = 0.0
     part: float = 1.0
+    number: int = 0
 
     @property
     def kind(self) -> str:
         """The name used in the statistics."""
-        at_times = " at times" if self.part < 1.0 else ""
-        return f"{kind_of(self.device)} {self.fault}{at_times}"
+        which = " once" if self.number else " at times" if self.part < 1.0 else ""
+        return f"{kind_of(self.device)} {self.fault}{which}"
 
 
 class Stall(_Happening, frozen=True, kw_only=True, tag="stall"):
@@ -284,6 +290,8 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
     if random.random() < _LEARNER:
         happenings += _learner(random, duration_s, stars_of(rig))
         settings += learning(rig) if random.random() < _LEARNS else []
+    if random.random() < _KILLED_SEARCHES:
+        happenings += _killed_search(random, random.uniform(*_HELD_S))
     happenings.sort(key=lambda happening: happening.at_s)
     console_loss = random.random() ** 2 if random.random() < _CONSOLE_SLOW else 0.0
     remote_consoles = random.randint(1, 3) if random.random() < _REMOTE else 0
@@ -360,10 +368,9 @@ def _strike(random: Random, at_s: float, devices: list[str], faults: list[str]) 
         fault = random.choice(wrong)
     if fault == "power cut" and not device.endswith("siderostat"):
         fault = "reset"  # only encoders forget anything
-    size = drawn_slowness(random) if fault == "slow" else 0.0
-    if kind_of(device) == "piezo" and fault == "stuck":
-        size = float(random.randrange(3))
+    size = _drawn_size(random, device, fault)
     at_times = fault in OF_SOME_CALLS and random.random() < _AT_TIMES
+    once = at_times and random.random() < _ONCE
     lasts_s = 10 ** random.uniform(-2.0, 1.0)
     return [
         Strike(
@@ -372,9 +379,19 @@ def _strike(random: Random, at_s: float, devices: list[str], faults: list[str]) 
             fault=fault,
             lasts_s=0.0 if fault in AT_ONCE else lasts_s * (_LASTS_LONGER if at_times else 1.0),
             size=size,
-            part=10 ** random.uniform(-2.5, -0.1) if at_times else 1.0,
+            part=10 ** random.uniform(-2.5, -0.1) if at_times and not once else 1.0,
+            number=random.randint(1, _LAST_CALL) if once else 0,
         )
     ]
+
+
+def _drawn_size(random: Random, device: str, fault: str) -> float:
+    """How slow, which stack, or by how much an encoder is wrong."""
+    if fault == "slow":
+        return drawn_slowness(random)
+    if fault == "encoder":
+        return random.choice((-1, 1)) * 10 ** random.uniform(*_WRONG_RAD)
+    return float(random.randrange(3)) if kind_of(device) == "piezo" and fault == "stuck" else 0.0
 
 
 def _interrupted_slew(random: Random, at_s: float, loops: tuple[str, ...]) -> list[Happening]:
@@ -385,12 +402,27 @@ def _interrupted_slew(random: Random, at_s: float, loops: tuple[str, ...]) -> li
     struck_s = at_s + 0.1 + random.uniform(0.0, _SLEW_S)
     failing = _strike(random, struck_s, [f"{loop} siderostat"], [fault])
     stall = _stall(random, struck_s + random.uniform(0.0, _MEETS_S))
+    if fault == "slow" and random.random() < _BRIEFLY:  # readings come late while motors turn on
+        failing = [msgspec.structs.replace(failing[0], lasts_s=random.uniform(0.05, 0.5))]
+        stall = [Stall(at_s=struck_s, lasts_s=random.uniform(0.02, 0.2))]
     return [
         Order(at_s=at_s, who=who, command=Release(loop=loop)),
         Order(at_s=at_s + 0.1, who=who, command=far),
         *failing,
         *random.choice(([], stall)),
     ]
+
+
+def _killed_search(random: Random, at_s: float) -> list[Happening]:
+    """Clouds hide the stars for long, and in the search for them the supervisor is killed, up to four times."""
+    who, lasts_s = OPERATORS[0], random.uniform(*_HIDDEN_S)
+    cloud = Cloud(at_s=at_s, lasts_s=lasts_s, part=0.0)
+    happenings: list[Happening] = [cloud]
+    for _ in range(random.randint(1, 4)):
+        killed_s = at_s + lasts_s * random.uniform(0.3, 1.0)
+        happenings.append(Kill(at_s=killed_s, back_after_s=0.1))
+        happenings += [Order(at_s=killed_s + later_s, who=who) for later_s in (0.5, 2.0, 3.0)]
+    return happenings
 
 
 def _disturbed_rest(random: Random, at_s: float, loops: tuple[str, ...]) -> list[Happening]:

@@ -1,20 +1,26 @@
 """A recorder on virtual time that can die, behind the supervisor's real record queue.
 
 `Wire` replaces ZeroMQ. It keeps each message until the recorder receives it, and loses all of them when the
-recorder dies. A recorder that dies also loses what it has not flushed. A new one starts a second later.
+recorder dies. A recorder that dies also loses what it has not flushed. A new one starts a second later, unless
+the log is being finished.
 """
 
 from __future__ import annotations
 
+import math
+import re
 from collections import deque
+from collections.abc import Callable
 from types import SimpleNamespace
 
 import msgspec
 
 from benchmarks.swarm.threads import VirtualTime
+from fitctl.daemon.last_records import finish_log
 from fitctl.logging.queue import RecordQueue
 
 _TAKE_S, _FLUSH_S = 0.05, 0.5
+_QUIET_S, _DRAIN_S = 0.2, 2.0  # as in fitctl.logging.recorder
 _BACK_S = 1.0  # fitctl.daemon.children checks once a second
 _encode = msgspec.msgpack.encode
 _sequence_of = msgspec.msgpack.Decoder(tuple[int, int, msgspec.Raw]).decode
@@ -42,10 +48,13 @@ class Wire:
         Maximum number of messages on the wire.
     recorder : bytes
         Identity of the connected recorder; empty without one.
+    sleep : callable
+        Waits on virtual time.
     """
 
     def __init__(self) -> None:
         self.size = 0
+        self.sleep: Callable[[float], None] = lambda _duration_s: None
         self.recorder = b""
         self.sent: deque[bytes] = deque()
         self.closed = False
@@ -55,8 +64,10 @@ class Wire:
         """Send an answer from the recorder."""
         self._answers.append((self.recorder, _encode(number)))
 
-    def poll(self, _timeout_ms: int) -> bool:
-        """Whether an answer has arrived."""
+    def poll(self, timeout_ms: int) -> bool:
+        """Whether an answer has arrived, if need be after the timeout."""
+        if timeout_ms and not self._answers:
+            self.sleep(timeout_ms / 1e3)
         return bool(self._answers)
 
     def recv_multipart(self, _flags: int) -> tuple[bytes, bytes]:
@@ -96,6 +107,8 @@ ZMQ = SimpleNamespace(
 class SwarmRecorder:
     """The recorder of one supervisor, restarted as long as the supervisor lives.
 
+    To `finish_log` it is a :class:`fitctl.daemon.children.Child`.
+
     Parameters
     ----------
     time : VirtualTime
@@ -120,45 +133,82 @@ class SwarmRecorder:
         self._wire: Wire = queue._socket  # type: ignore[assignment]
         self._unflushed: list[int] = []
         self._starts = 0
-        self._ended = False
+        self._stays_dead = False  # nobody starts it again
+        self._ends_s = math.inf  # it was asked to end, and takes nothing after this time
         self.stuck_until_s = 0.0
+        self._wire.sleep = time.sleep
         self._start()
 
-    def end(self) -> None:
-        """Stop for good, because the supervisor has ended."""
-        self._ended = True
+    @property
+    def running(self) -> bool:
+        """It runs, or hangs."""
+        return bool(self._wire.recorder)
+
+    def ask_to_end(self) -> None:
+        """Let it receive what is there, write everything and end."""
+        self._ends_s = self._time.now_s() + _DRAIN_S
+
+    def end(self, timeout_s: float = 0.0) -> None:
+        """It is gone for good, with what it has not written."""
+        self._stays_dead = True
+        self.die()
+
+    def finish(self) -> str:
+        """The supervisor's process ends its log, and reports what may be missing.
+
+        Returns
+        -------
+        str
+            What is missing and was not reported; empty if all is well.
+        """
+        self._stays_dead = True
+        reported: list[str] = []
+        finish_log(self._queue, self, reported.append)  # type: ignore[arg-type]
+        missing = self._queue.offered - len(self.written) - self._queue.lost
+        found = [re.search(r"confirm the last (\d+) of", line) for line in reported]
+        unconfirmed = sum(int(match[1]) for match in found if match)
+        if 0 <= missing <= unconfirmed:
+            return ""
+        return f"at the end {missing} are not written; reported: {'; '.join(reported) or 'nothing'}"
 
     def die(self) -> None:
         """Die, and start again after a second."""
-        if self._ended or not self._wire.recorder:
+        if not self._wire.recorder:
             return
         self._wire.recorder = b""
         self._wire.sent.clear()
         self._unflushed.clear()
-        self._time.call_at(self._time.now_s() + _BACK_S, self._start)
+        if not self._stays_dead:
+            self._time.call_at(self._time.now_s() + _BACK_S, self._start)
 
     def _start(self) -> None:
-        if self._ended:
+        if self._stays_dead:
             return
         self._starts += 1
         self._wire.recorder = str(self._starts).encode()
         self._wire.answer(-1)
+        self._quiet_from_s = self._time.now_s()
         self._flush_s = self._time.now_s() + _FLUSH_S
         self._take(self._starts)
 
     def _take(self, start: int) -> None:
         """Receive all messages, and flush when due. Does nothing if the recorder was restarted meanwhile."""
-        if self._ended or start != self._starts or not self._wire.recorder:
+        if start != self._starts or not self._wire.recorder:
             return
         now_s, goes_on_s = self._time.now_s(), max(self.stuck_until_s, self._time.goes_on_s)
         if now_s < goes_on_s:
             self._time.call_at(goes_on_s, lambda: self._take(start))
             return
         sent = self._wire.sent
+        if sent:
+            self._quiet_from_s = now_s
         while sent:
             _version, sequence, _record = _sequence_of(sent.popleft())
             self._unflushed.append(sequence)
-        if now_s >= self._flush_s and self._unflushed:
+        is_last = self._ends_s < math.inf and (
+            now_s >= self._ends_s or now_s - self._quiet_from_s >= _QUIET_S
+        )
+        if self._unflushed and (is_last or now_s >= self._flush_s):
             if self.disk_is_full:
                 self.die()
                 return
@@ -166,6 +216,9 @@ class SwarmRecorder:
             self.written.update(self._unflushed)
             self._wire.answer(self._unflushed[-1])
             self._unflushed.clear()
+        if is_last:
+            self.end()
+            return
         self._time.call_at(now_s + _TAKE_S, lambda: self._take(start))
 
     def waits_since(self, offered: int) -> int:

@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from random import Random
 from time import process_time
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
@@ -86,12 +87,13 @@ _ANSWERED_AT_THE_END_S = 1.5
 _WIND_DOWN_S = 1.0  # as fitctl.daemon.run
 _START_S = 2.0
 _CLOSING_S = 31.0  # the supervisor waits 30 s for its devices
-_LAST_RECORDS_S = 5.0
 _SEQUENCE_ENDS_S = 15.0
 _MOST_DESIGN_S = 20.0
 _NOISE_STEP = 1.05
 _SAVED_S = 1.0  # so often a supervisor leaves where its stars are
-_MISLED_S = 10.0  # for so long after a repeated image, a loop may still follow what it showed
+_MISLED_S = (
+    10.0  # for so long after a repeated image, or a wrong encoder, a star's place may be wrong
+)
 _BACK_S = 15.0  # after a kill or a shutdown, and what was waited for when all was healed
 _STAY_S = 5.0  # for so long a star that is held must stay so
 _STAYS_PX = 0.5  # mean over a second
@@ -351,12 +353,10 @@ class Instrument:
         self.recorder.disk_is_full = self._disk_is_full
 
     def _finish_log(self) -> None:
-        """As :func:`fitctl.daemon.last_records.finish_log`."""
-        end_s = self.time.now_s() + _LAST_RECORDS_S
-        while self._queue.waiting and self.time.now_s() < end_s:
-            self._queue.pump()
-            self.time.sleep(0.05)
         self.account_for_records()
+        unreported = self.recorder.finish()
+        if unreported:
+            self.invariants.violated("a record is written or counted", unreported)
 
     def account_for_records(self) -> None:
         """Every record is written, or waits, or was counted."""
@@ -397,7 +397,10 @@ class Instrument:
         if isinstance(record, ModeChange):
             self.modes[record.target] = self.modes.get(record.target, 0) + 1
             if record.target == Mode.COARSE.name and record.loop in self.rig.stellar_loops:
-                self.found_s.setdefault(record.loop, record.time_s)
+                link = self.rig.stellar_loops[record.loop].link
+                turned_by = [self.amplifiers[name] for name in (record.loop, link) if name]
+                if not any(each.line.was_wrong("encoder", _MISLED_S) for each in turned_by):
+                    self.found_s.setdefault(record.loop, record.time_s)
         if self.found_s and self.camera.line.was_wrong("frozen", _MISLED_S):
             self.found_s.clear()  # a repeated image has a star where none is: its place may be wrong
         self._on_record(record)
@@ -502,7 +505,10 @@ class Instrument:
                 self.amplifiers[loop_name].trip()
             case fault:
                 line = self.lines[strike.device]
-                line.begin(fault, strike.lasts_s, strike.size, strike.part)
+                line.begin(fault, strike.lasts_s, strike.size, strike.part, strike.number)
+                if fault == "encoder":
+                    self.invariants.encoder_wrong(loop_name)
+                    self._forget_places(loop_name)
 
     def _cut_power(self, name: str) -> None:
         """Restart a loop's encoders at zero; the places of the stars that it turns are unknown from then on.
@@ -521,10 +527,13 @@ class Instrument:
             return
         self.invariants.zero_lost(name)
         self.amplifiers[name].lose_power()
-        self.found_s.pop(name, None)
-        for linked, loop in self.rig.stellar_loops.items():
-            if loop.link == name:
-                self.found_s.pop(linked, None)
+        self._forget_places(name)
+
+    def _forget_places(self, name: str) -> None:
+        """The places of the stars that a loop's siderostat turns are not to be relied on."""
+        for star, loop in self.rig.stellar_loops.items():
+            if name in {star, loop.link}:
+                self.found_s.pop(star, None)
 
     def _sky_arcsec_per_rad(self, name: str) -> float:
         return motor_sky_rad_per_rad(self.rig.loops[name].siderostat) * ARCSEC_PER_RAD
@@ -592,6 +601,8 @@ def _run(plan: Plan, on_record: Callable[[AnyRecord], None], began_s: float) -> 
     with (
         installed(time),
         patch("fitctl.logging.queue.zmq", ZMQ),
+        patch("fitctl.logging.queue.time", SimpleNamespace(monotonic=time.now_s)),
+        patch("fitctl.daemon.last_records.time", SimpleNamespace(monotonic=time.now_s)),
         client_installed(time, subscribers),
         service_installed(time, Random(f"{plan.seed} service")),  # noqa: S311
     ):

@@ -25,7 +25,15 @@ import zmq
 from benchmarks.swarm.invariants import Invariants
 from benchmarks.swarm.telemetry_wire import Publisher
 from benchmarks.swarm.threads import VirtualEvent, VirtualTime, standing_for
-from fitctl.logging.records import AnyRecord, Event
+from fitctl.logging.records import (
+    AnyRecord,
+    Event,
+    LoopTiming,
+    MetrologyTick,
+    ModeChange,
+    PiezoReading,
+    Tick,
+)
 from fitctl.messages.commands import (
     AnyCommand,
     RecentEvents,
@@ -49,6 +57,7 @@ SENDERS = {
 }
 """By name. The first three can send commands."""
 _ANSWERED_HERE = (Status, RecentEvents, RecorderReport, TakeOver)
+_SHOWN = frozenset({Event, LoopTiming, MetrologyTick, ModeChange, PiezoReading, Tick})
 _ROUND_S = 0.005
 _ENDS_S = 5.0
 _LOCAL_S = (1e-5, 1e-3)
@@ -193,6 +202,8 @@ class SwarmService(Service):
     ----------
     events : int
         Reported until now.
+    newest : dict
+        Of the records that consoles show, the newest by kind and loop.
     subscribers : list of callable
         Each takes every telemetry message.
     """
@@ -216,6 +227,7 @@ class SwarmService(Service):
         )
         self.buffer = _Buffer()
         self.events = 0
+        self.newest: dict[tuple[type, str], AnyRecord] = {}
         self.subscribers: list[Callable[[Telemetry], None]] = []
         super().__init__(supervisor, self.buffer, Path(), state, time)
         self._admission = _WatchedAdmission(supervisor.rig.service.lease_s, invariants)
@@ -236,7 +248,12 @@ class SwarmService(Service):
 
     def take(self, record: AnyRecord) -> None:
         """Add a record to the next telemetry."""
-        self.events += isinstance(record, Event)
+        kind = type(record)
+        if kind in _SHOWN:
+            # A change into the same mode leaves the reason of the one before.
+            if kind is not ModeChange or record.source != record.target:  # type: ignore[union-attr]
+                self.newest[kind, getattr(record, "loop", "")] = record
+            self.events += kind is Event
         self.buffer.add(record)
 
     def stop(self) -> None:

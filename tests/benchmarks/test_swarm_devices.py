@@ -121,6 +121,21 @@ def test_motors_that_are_stuck_do_not_move_until_they_come_free(amplifiers, does
     assert turned_rad(amplifiers, does) > 0.05
 
 
+def test_an_encoder_that_is_wrong_reads_another_angle_and_the_motor_stays_where_it_is(
+    amplifiers, does
+):
+    def read_rad():
+        return does(partial(amplifiers.exchange, (0.0, 0.0))).position_rad
+
+    right_rad = read_rad()
+    amplifiers.line.begin("encoder", 60.0, size=-1.5)
+    wrong_rad = read_rad()
+    amplifiers.line.heal()
+
+    assert wrong_rad == pytest.approx((right_rad[0] - 1.5, right_rad[1]))
+    assert read_rad() == right_rad
+
+
 def test_amplifiers_that_trip_have_no_power_until_their_fault_is_reset(amplifiers, does):
     amplifiers.trip()
 
@@ -214,6 +229,16 @@ def test_photodiodes_are_at_the_end_of_their_range(time, plant, does):
     assert min(volts) >= sensor.saturated_v
 
 
+def test_photodiodes_that_refuse_a_request_say_so(time, plant, does):
+    photodiodes = SwarmPhotodiodes(plant.loops["metrology"], time, RIG, "metrology", Random(1))
+    does(photodiodes.open)
+    photodiodes.line.begin("refuses", 60.0)
+    photodiodes.send_request()
+
+    with pytest.raises(DeviceRefused):
+        photodiodes.receive()
+
+
 # ------------------------------------------------------------ whole runs
 
 
@@ -227,20 +252,21 @@ def run_without_violation(rig, duration_s, happenings):
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("device", "fault", "reason"),
+    ("device", "fault", "size", "reason"),
     [
-        ("right siderostat", "trip", "overcurrent"),
-        ("right siderostat", "stuck", "following error"),
-        ("right piezo", "stuck", "stack 2"),
-        ("right piezo", "limit", "its limit"),
-        ("right D/A", "tripped", "a refusal"),
+        ("right siderostat", "trip", 0.0, "overcurrent"),
+        ("right siderostat", "stuck", 0.0, "following error"),
+        ("right siderostat", "encoder", 3.0, "following error"),
+        ("right piezo", "stuck", 1.0, "stack 2"),
+        ("right piezo", "limit", 0.0, "its limit"),
+        ("right D/A", "tripped", 0.0, "a refusal"),
     ],
 )
-def test_a_wrong_value_leads_to_safe_and_violates_nothing(device, fault, reason):
+def test_a_wrong_value_leads_to_safe_and_violates_nothing(device, fault, size, reason):
     happenings = [
         Order(at_s=0.1, who="ada"),
         Order(at_s=2.0, who="ada"),  # the search moves the siderostat
-        Strike(at_s=2.5, device=device, fault=fault, lasts_s=4.0, size=1.0),
+        Strike(at_s=2.5, device=device, fault=fault, lasts_s=4.0, size=size),
     ]
     records = run_without_violation("fit-mock.toml", 8.0, happenings)
     reasons = [
@@ -317,6 +343,16 @@ def test_a_fault_of_some_calls_meets_that_fraction_of_them(time, does):
     assert not line.is_silent
     line.heal()
     assert not line.is_bad
+
+
+def test_a_fault_may_meet_a_single_call(time, does):
+    line = Line("D/A", "", time, Random(1), 0.001, 0.1)
+    line.open()
+    line.begin("refuses", 60.0, number=3)
+    answers = [does(lambda: line.ask(lambda: "done")) for _ in range(10)]
+
+    assert [type(answer) for answer in answers] == [*[str] * 2, DeviceRefused, *[str] * 7]
+    assert line.is_readable
 
 
 def test_a_fault_of_all_calls_does_not_last_as_long_as_one_of_some(time):

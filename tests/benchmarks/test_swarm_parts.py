@@ -2,6 +2,7 @@
 
 from functools import partial
 from random import Random
+from types import SimpleNamespace
 from typing import get_args
 
 import msgspec
@@ -34,6 +35,7 @@ from benchmarks.swarm.run import run_plan
 from benchmarks.swarm.service import SENDERS, SwarmService
 from benchmarks.swarm.telemetry_wire import RemoteConsole
 from fitctl.config import load_rig
+from fitctl.daemon import last_records
 from fitctl.logging.queue import RecordQueue
 from fitctl.logging.records import ControllerChange, Event, RecorderStatus
 from fitctl.messages import client
@@ -84,8 +86,11 @@ def gives(at_s, command, who="ada"):
 
 
 @pytest.fixture
-def queue(monkeypatch):
+def queue(monkeypatch, time):
     monkeypatch.setattr("fitctl.logging.queue.zmq", ZMQ)
+    clock = SimpleNamespace(monotonic=time.now_s)
+    monkeypatch.setattr("fitctl.logging.queue.time", clock)
+    monkeypatch.setattr("fitctl.daemon.last_records.time", clock)
     return RecordQueue("swarm", 50)
 
 
@@ -158,6 +163,53 @@ def test_a_recorder_stands_still_with_its_machine(time, queue):
     time.run_until(4.0)
 
     assert recorder.written == set(range(5))
+
+
+def finish(time, recorder):
+    """What is missing at the end and was not reported."""
+    found = []
+    time.spawn(lambda: found.append(recorder.finish()), "main")
+    time.run_until(time.now_s() + 30.0)
+    (unreported,) = found
+    return unreported
+
+
+def test_at_the_end_everything_is_written(time, queue):
+    recorder = SwarmRecorder(time, queue)
+    time.run_until(1.0)
+    offer(queue, time, 40)
+
+    assert finish(time, recorder) == ""
+    assert recorder.written == set(range(40))
+    assert not recorder.running
+
+
+@pytest.mark.parametrize("trouble", ["stuck", "full disk", "dead"])
+@pytest.mark.parametrize("reports", [True, False])
+def test_what_is_not_written_at_the_end_must_be_reported(
+    monkeypatch, time, queue, trouble, reports
+):
+    if not reports:
+        silent = partial(_finish_log_silently, last_records.finish_log)
+        monkeypatch.setattr("benchmarks.swarm.recorder.finish_log", silent)
+    recorder = SwarmRecorder(time, queue)
+    time.run_until(1.0)
+    recorder.stuck_until_s = 100.0 if trouble == "stuck" else 0.0
+    recorder.disk_is_full = trouble == "full disk"
+    if trouble == "dead":
+        recorder.die()
+    offer(queue, time, 40)
+    unreported = finish(time, recorder)
+
+    assert recorder.written == set()
+    assert not recorder.running
+    expected = "" if reports else "at the end 40 are not written; reported: nothing"
+    # Records that a dead recorder was never sent count as lost.
+    assert unreported == ("" if trouble == "dead" else expected)
+
+
+def _finish_log_silently(finish_log, queue, recorder, _report):
+    finish_log(queue, recorder, lambda _line: None)
 
 
 # ------------------------------------------------------------ lease and rights
@@ -393,6 +445,21 @@ def test_a_console_that_shows_another_mode_is_noticed(monkeypatch):
     result = run_plan(plan(gives(0.1, None), gives(1.0, Acquire()), duration_s=2.0))
 
     assert "the console shows what is" in {one.invariant for one in result.violations}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", ["ticks", "piezo", "timing", "events"])
+def test_a_console_that_does_not_show_the_newest_of_a_kind_is_noticed(monkeypatch, kind):
+    accept = ConsoleState.accept
+
+    def forget(self, message, now_s):
+        accept(self, msgspec.structs.replace(message, **{kind: getattr(message, kind)[:-1]}), now_s)
+
+    monkeypatch.setattr(ConsoleState, "accept", forget)
+    happens = [gives(at_s, None) for at_s in (0.1, 1.0, 2.0, 3.0)]
+    (violation,) = run_plan(plan(*happens, duration_s=12.0)).violations
+
+    assert violation.invariant == "the console shows what is"
 
 
 REMOTE = msgspec.structs.replace(

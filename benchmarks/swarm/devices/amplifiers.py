@@ -5,7 +5,8 @@ A drive keeps its last velocity until it misses the master's heartbeat.
 A CANopen drive that misses its master stops with a fault. The I/O station of analogue amplifiers drops the
 enable lines until the next write. An Ensemble has no such watchdog, and turns until it reaches its own limits.
 
-Known limitations: a drive without its master stops at once, without a ramp; a reset takes no time.
+Known limitations: a drive without its master stops at once, without a ramp; a reset takes no time; only the
+encoder of azimuth is ever wrong.
 """
 
 from __future__ import annotations
@@ -266,10 +267,16 @@ class SwarmAmplifiers:
     def _as_driver_has_it(self, reading: ServoReading) -> ServoReading:
         # Analogue amplifiers have no line that reports an enabled axis.
         has_power = self._enables and not self.fault if self._enables_by_line else self.powered
-        if has_power is reading.enabled and self.zero_rad is _STILL and not self.fault:
+        wrong_rad = self.line.wrong_by("encoder")
+        if (
+            has_power is reading.enabled
+            and self.zero_rad is _STILL
+            and not self.fault
+            and wrong_rad is None
+        ):
             return reading  # as at nearly every period
         (az_rad, el_rad), (zero_az_rad, zero_el_rad) = reading.position_rad, self.zero_rad
-        position_rad = az_rad - zero_az_rad, el_rad - zero_el_rad
+        position_rad = az_rad - zero_az_rad + (wrong_rad or 0.0), el_rad - zero_el_rad
         return ServoReading(reading.time_s, position_rad, has_power, self.fault)
 
     def _hear(self, velocity_rad_s: AzEl) -> ServoReading:

@@ -15,7 +15,6 @@ from fitctl.config import Rig
 from fitctl.drivers.interface import (
     DeviceIdentity,
     DeviceMismatch,
-    DeviceRefused,
 )
 from fitctl.simulation.devices import (
     SimulatedMirror,
@@ -101,7 +100,7 @@ class SwarmDac:
     def _refuse_if_tripped(self) -> None:
         if "tripped" in self.line.wrong:
             self._make_safe()
-            raise DeviceRefused("D/A", self.line.endpoint, "to obey", "a refusal", "reset it")
+            raise self.line.refused()
 
     def _set(self, volts: Floats) -> None:
         self._refuse_if_tripped()

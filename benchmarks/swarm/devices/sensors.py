@@ -25,7 +25,7 @@ from fitctl.simulation.devices import (
 )
 
 Floats = NDArray[np.float64]
-_SILENCE = frozenset({"deaf", "mute", "refuses", "garbled"})
+_SILENCE = frozenset({"deaf", "mute"})
 _MOST_LATE_FRAMES = 20
 _DROPPED = 0.5  # of the frames
 
@@ -163,6 +163,9 @@ class SwarmPhotodiodes(SimulatedPhotodiodes):
             raise self.line.broken()
         if "garbled" in faults:
             raise self.line.garbled()
+        if "refuses" in faults and self._requested_s:
+            self._requested_s.clear()
+            raise self.line.refused()
         self._round_trip_s = self._usual_s * faults.get("slow", 1.0)
         silent = bool(faults.keys() & _SILENCE)
         reading = None if silent else super().receive()
