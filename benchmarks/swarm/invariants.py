@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 from benchmarks.swarm.devices.amplifiers import SwarmAmplifiers
 from benchmarks.swarm.devices.hexapod import SwarmHexapod
 from benchmarks.swarm.lines import Line
+from benchmarks.swarm.motion import Motion
 from fitctl.clock import Clock
 from fitctl.config import Rig
-from fitctl.config.base import ARCSEC_PER_RAD
 from fitctl.controllers.pair import LEARNT
-from fitctl.drivers.interface import AzEl, Pose
 from fitctl.logging.records import (
     AnyRecord,
     ControllerChange,
@@ -38,13 +37,13 @@ from fitctl.messages.commands import (
     Off,
     Recover,
     Reply,
+    SequenceControl,
     SetBiasOffset,
     Standby,
     Stop,
 )
 from fitctl.messages.modes import FOLLOWING, OPERATOR, Mode, Trigger
 from fitctl.model.drives import experiment_s
-from fitctl.model.optics import motor_sky_rad_per_rad
 from fitctl.model.plant import Plant
 from fitctl.service.admission import Sender
 from fitctl.stages.journal import NO_MISTAKE
@@ -53,11 +52,10 @@ from fitctl.supervisor.supervisor import Supervisor
 Floats = NDArray[np.float64]
 NO_EXCEPTION = "no exception escapes"
 ANSWERED_ONCE = "a command is answered once"
-_SLACK = 1.0 + 1e-6
 POWER_S = 1.0  # a loop may have power without need, or need without power, no longer than this
 _AT_REST = frozenset({Mode.OFF, Mode.SAFE})
 _FOLLOWING = frozenset(mode.name for mode in FOLLOWING)
-_SLOWLY = frozenset({Mode.OFF, Mode.SAFE, Mode.STANDBY})
+_CAUSE_S = 10.0  # before a fault, in which its cause must have been
 _FOR_ALL = {"Status", "RecentEvents"}
 _OF_THIS_MACHINE = {"RecorderReport", "LearnerReport"}
 _OF_COMMANDERS = {"Stop", "TakeOver", "SequenceControl", "SequenceReport"}
@@ -75,13 +73,11 @@ _ANOTHERS_PX = 6.0  # from its own star, no window of a loop shows its own
 _MOST_WRONG_S = 10.0
 # As `made_safe` in the fault catalogue, tests/faults/devices.py.
 _SAFE_S, _SAFE_BY_PIEZO_S = 3.0, 8.0
-_MIRROR_RESTS_S = 1.0  # beyond the time that a mirror takes through its whole range
 _STUCK_S = 1.0  # for so long after motors were stuck, a servo may still be behind its reference
 _RESTS_S = 1.0  # beyond the time after which a drive without its master stops by itself
 _SURELY = 1.2  # times the following error limit: a servo that is behind so far must notice
-_HARDLY = 0.02  # of the velocity limit: slower, a servo corrects what its encoder counts
-_MOVED_S = 1.0  # beyond the time that a siderostat takes from one end of its travel to the other
 _COLLECTOR_RESTS_S = 3.0
+_SEQUENCE_ENDS_S = 15.0
 _EXPERIMENT_ENDS_S = 1.0  # after its last motion
 
 
@@ -152,35 +148,20 @@ class Invariants:
         self._lines = lines
         self._plant = plant
         self._supervisor: Supervisor | None = None
-        # What every tick needs, once.
+        self.motion = Motion(
+            rig, clock, amplifiers, lines, plant, self.violated, self._zero_is_lost
+        )
         self._stellar_loops = rig.stellar_loops
-        self._most_rad_s = {
-            name: loop.siderostat.velocity_limit_rad_s * _SLACK for name, loop in rig.loops.items()
-        }
-        self._three_periods_s = {
-            name: 3 / loop.siderostat.servo.rate_hz for name, loop in rig.loops.items()
-        }
-        self._travel_rad, self._coasts_rad, self._moved_s = {}, {}, {}
-        for name, loop in rig.loops.items():
-            siderostat = loop.siderostat
-            sky_arcsec_per_rad = motor_sky_rad_per_rad(siderostat) * ARCSEC_PER_RAD
-            self._travel_rad[name] = siderostat.travel_sky_arcsec / sky_arcsec_per_rad
-            # A servo acts on readings of up to this age, and its command takes up to three periods to arrive.
-            unseen_s = self._three_periods_s[name] + 1 / siderostat.servo.gain_per_s
-            self._coasts_rad[name] = siderostat.velocity_limit_rad_s * unseen_s
-            crossing_s = 2 * self._travel_rad[name] / siderostat.velocity_limit_rad_s
-            self._moved_s[name] = crossing_s + _MOVED_S
         self._needed = {name: list(self._needed_devices(name)) for name in rig.loops}
         camera = rig.camera
         self._oldest_s = camera.frame_delay_s + _MOST_PERIODS * camera.period_s
         self._most_step_s = _MOST_STEP_S * (1 + len(self._stellar_loops))
-        self._slowly: dict[str, bool] = {}
-        self._mirror_moved_s: dict[str, float] = {}  # by loop: when something moved it that may
         self._busy_since_s = math.inf
         self._stepped_s = 0.0
         self._powerless, self._unneeded = _Lasting(), _Lasting()
         self._silent, self._turning, self._stopped_for = _Lasting(), _Lasting(), _Lasting()
-        self._experimenting, self._sticking = _Lasting(), _Lasting()
+        self._experimenting, self._sticking, self._ending = _Lasting(), _Lasting(), _Lasting()
+        self._ended_run = ""  # the sequence that was ordered to end last
         self._lasting = (
             self._powerless,
             self._unneeded,
@@ -189,22 +170,23 @@ class Invariants:
             self._stopped_for,
             self._experimenting,
             self._sticking,
+            self._ending,
         )
-        self._ticked_s = self._stall_ended_s = 0.0
-        self._jogged_s: dict[str, float] = {}
+        self._ticked_s = 0.0
         self._experiment_s: dict[str, float] = {}  # by loop: how long the newest takes
         self._collector_is_stopped = False
         self.nothing_fails = False
-        self._stopped_s: dict[str, float] = {}  # by loop: a stop that no power-up has followed
         self._power_up_s: dict[str, float] = {}
         self._stop_answered_s: dict[str, float] = {}
         self._texts: Counter[str] = Counter()  # of errors, since devices were opened
         self._piezo_read_s: dict[str, float] = {}
         self._lease = "", -math.inf
+        self._admitted: list[tuple[AnyCommand, str]] = []  # and not yet passed on
         self._opened: set[str] = set()
         self._zeros_lost_rad: dict[str, float] = {}  # by loop: nobody has read the encoders since
         self._zeros_read_rad: dict[str, float] = {}  # by loop: read, in an opening that goes on
         self._zeros_noticed_s: dict[str, float] = {}
+        self._struck_s: dict[str, float] = {}  # by device
         self._misread: set[str] = set()  # loops whose encoders may have been read wrongly
         self._checked_s: dict[str, float] = {}  # by loop: when the swarm last checked its star
         self._wrong_since_s: dict[str, float] = {}  # by loop: since when it follows another star
@@ -234,19 +216,18 @@ class Invariants:
             if self._clock.now_s() - noticed_s < _LEFT_S:
                 self._zeros_lost_rad.setdefault(name, 0.0)
         self._supervisor = supervisor
+        self.motion.watch(supervisor)
         self._lease = "", -math.inf
+        self._admitted.clear()
         self._opened.clear()
-        self._stopped_s.clear()
         self._power_up_s.clear()
         self._stop_answered_s.clear()
         self._texts.clear()
         self._piezo_read_s = dict.fromkeys(self._rig.loops, math.inf)
-        self._slowly.clear()
         self._wrong_since_s.clear()
         self._pointed_at.clear()
         for lasting in self._lasting:
             lasting.clear()
-        self._jogged_s.clear()
         self._collector_is_stopped = False
         self._busy_since_s = math.inf
         # A machine that stands still does so for the next supervisor too.
@@ -261,10 +242,10 @@ class Invariants:
     def stalled(self, until_s: float, added_s: float) -> None:
         """The machine stands still, `added_s` longer than was known, and nothing can be expected of it."""
         self._stepped_s = max(self._stepped_s, until_s)
-        self._stall_ended_s = until_s
+        self.motion.stall_ended_s = until_s
         self._ticked_s += added_s  # so that a stall is not left out twice
-        for name in self._stopped_s:
-            self._stopped_s[name] = max(self._stopped_s[name], self._stepped_s)
+        for name in self.motion.stopped_s:
+            self.motion.stopped_s[name] = max(self.motion.stopped_s[name], self._stepped_s)
         for lasting in self._lasting:
             lasting.leave_out(added_s)
 
@@ -274,6 +255,9 @@ class Invariants:
         if self._supervisor is not None:
             position_rad = float(np.abs(self._supervisor.loops[name].servo.position_rad).max())
         self._zeros_lost_rad[name] = max(position_rad, self._zeros_lost_rad.get(name, 0.0))
+
+    def _zero_is_lost(self, name: str) -> bool:
+        return name in self._zeros_lost_rad or name in self._zeros_read_rad
 
     def encoder_wrong(self, name: str) -> None:
         """An encoder of a loop reads wrong angles from now on."""
@@ -308,22 +292,36 @@ class Invariants:
         if may and (takes or (holder == sender.name and name not in _OF_THIS_MACHINE)):
             self._lease = sender.name, now_s
 
-    def posted(self, command: AnyCommand) -> None:
+    def obeyed(self, command: AnyCommand, sender: str) -> None:
+        """The service passes a command on to the supervisor, as its sender's."""
+        for number, (admitted, by) in enumerate(self._admitted):
+            if admitted is command and by == sender:
+                del self._admitted[number]
+                return
+        self.violated(
+            "lease and rights are kept", f"{type(command).__name__} of {sender} was not admitted"
+        )
+
+    def posted(self, command: AnyCommand, sender: str) -> None:
         """A command is on its way to the supervisor."""
+        self._admitted.append((command, sender))
         if isinstance(command, Stop):
             for name in self._named(command):
-                self._stopped_s[name] = self._clock.now_s()
+                self.motion.stopped_s[name] = self._clock.now_s()
         elif isinstance(command, SetBiasOffset | Off):  # `off` ends an offset
             for name in self._named(command):
-                self.mirror_moved(name)
+                self.motion.mirror_moved(name)
         elif isinstance(command, Jog):
-            self._jogged_s |= dict.fromkeys(self._named(command), self._clock.now_s())
+            self.motion.jogged_s |= dict.fromkeys(self._named(command), self._clock.now_s())
 
     def answered(self, command: AnyCommand, reply: Reply) -> None:
         """A command was obeyed or refused."""
         if not reply.accepted:
             return
         now_s = self._clock.now_s()
+        if isinstance(command, SequenceControl) and command.action == "end":
+            status = self._supervisor.sequences.status() if self._supervisor else None
+            self._ended_run = status.run if status else ""
         if isinstance(command, Stop | MoveCollector):  # a stop of whichever loop
             stops = isinstance(command, Stop) or command.action == "stop"
             self._collector_is_to_stop(is_so=stops)
@@ -331,9 +329,9 @@ class Invariants:
             if isinstance(command, Stop):
                 self._stop_answered_s[name] = now_s
             elif isinstance(command, SetBiasOffset):
-                self.mirror_moved(name)
+                self.motion.mirror_moved(name)
             elif isinstance(command, Jog):
-                self._jogged_s[name] = now_s
+                self.motion.jogged_s[name] = now_s
             elif isinstance(command, Standby | Recover):
                 self._power_up_s[name] = now_s
             elif isinstance(command, Look):
@@ -470,18 +468,47 @@ class Invariants:
         if change.target == Mode.SAFE.name and change.source != Mode.SAFE.name:
             self._collector_is_to_stop(is_so=True)
         if change.target == Mode.STANDBY.name and change.source in {"OFF", "SAFE"}:
-            self._stopped_s.pop(name, None)
+            self.motion.stopped_s.pop(name, None)
             stop_s = self._stop_answered_s.get(name, -math.inf)
             if self._power_up_s.get(name, math.inf) < stop_s:
                 self.violated("a stop has the last word", f"{name}: powered up after it")
         if "following error below" in change.reason and not self._was_stuck(name):
             self.violated("an axis that is not stuck is not called so", f"{name}: {change.reason}")
-        if change.trigger == Trigger.FAULT.name and self.nothing_fails:
+        if change.trigger == Trigger.FAULT.name and not self._has_cause(name, change.reason):
             self.violated("without a fault nothing fails", f"{name}: {change.reason}")
+
+    def struck(self, device: str) -> None:
+        """Something happens to a device at once, or begins."""
+        self._struck_s[device] = self._clock.now_s()
+
+    def _has_cause(self, name: str, reason: str) -> bool:
+        """Whether the device that a reason names, of the loop or its link, failed, or the machine stalled.
+
+        Interlocks also watch the sky, the star and the computer, which have no device here.
+        """
+        if self.nothing_fails:
+            return False
+        now_s = self._clock.now_s()
+        if reason.startswith("interlock") or now_s - self.motion.stall_ended_s < _CAUSE_S:
+            return True
+        link = self._rig.stellar_loops[name].link if name in self._stellar_loops else None
+        named = {
+            device
+            for device, line in self._lines.items()
+            if device.partition(" ")[0] in {name, link, "camera", "hexapod"}
+            and reason.startswith(line.device)
+        }
+        return any(
+            self._lines[device].is_bad
+            or self._lines[device].wrong
+            or now_s - max(self._lines[device].healed_s, self._struck_s.get(device, -math.inf))
+            < _CAUSE_S
+            for device in named
+        )
 
     def _was_stuck(self, name: str) -> bool:
         """Its motors do not move or an encoder is wrong, or that was so recently, or before a recent stall."""
-        stalled = self._clock.now_s() - self._stall_ended_s < _STUCK_S
+        stalled = self._clock.now_s() - self.motion.stall_ended_s < _STUCK_S
         within_s = _MOST_WRONG_S if stalled else _STUCK_S
         line = self._lines[f"{name} siderostat"]
         return any(line.was_wrong(fault, within_s) for fault in ("stuck", "encoder"))
@@ -495,134 +522,9 @@ class Invariants:
 
     # ------------------------------------------------------------ what is sent
 
-    def velocity(self, name: str, velocity_rad_s: AzEl) -> None:
-        """A velocity is sent to a loop's motors."""
-        fastest_rad_s = max(abs(velocity_rad_s[0]), abs(velocity_rad_s[1]))
-        if not fastest_rad_s <= self._most_rad_s[name]:
-            self.violated("velocity within its limit", f"{name}: {velocity_rad_s} rad/s")
-        supervisor = self._supervisor
-        if supervisor is None or fastest_rad_s == 0.0:
-            return
-        if name in self._zeros_lost_rad or name in self._zeros_read_rad:
-            self.violated(
-                "no stage moves by a zero that is lost", f"{name}: {velocity_rad_s} rad/s"
-            )
-        else:
-            self._within_travel(name, velocity_rad_s)
-        loop, three_periods_s = supervisor.loops[name], self._three_periods_s[name]
-        since_stop_s = self._clock.now_s() - self._stopped_s.get(name, math.inf)
-        if since_stop_s > three_periods_s:
-            self.violated(
-                "a stop is obeyed at once",
-                f"{name}: {velocity_rad_s} rad/s {since_stop_s:.3f} s after it",
-            )
-        if loop.mode in _AT_REST:
-            at_rest_s = self._clock.now_s() - loop.mode_since_s
-            if at_rest_s > three_periods_s:
-                self.violated(
-                    "no stage moves in OFF or SAFE",
-                    f"{name}: {velocity_rad_s} rad/s after {at_rest_s:.3f} s in {loop.mode.name}",
-                )
-
-        elif loop.mode is Mode.STANDBY and fastest_rad_s > _HARDLY * self._most_rad_s[name]:
-            self._stands_by(name, loop.mode_since_s, velocity_rad_s)
-
-    def _within_travel(self, name: str, velocity_rad_s: AzEl) -> None:
-        """No motor that is beyond the travel, by the drive's count, is driven farther out."""
-        if self._lines[f"{name} siderostat"].was_wrong("encoder", _STUCK_S):
-            return
-        most_rad = self._travel_rad[name] + self._coasts_rad[name]
-        hardly_rad_s = _HARDLY * self._most_rad_s[name]
-        motors_rad = self._plant.loops[name].state.motor_rad[0].tolist()
-        zeros_rad = self._amplifiers[name].zero_rad
-        for motor_rad, zero_rad, rad_s in zip(motors_rad, zeros_rad, velocity_rad_s, strict=True):
-            position_rad = motor_rad - zero_rad
-            if (
-                abs(position_rad) > most_rad
-                and math.copysign(rad_s, position_rad * rad_s) > hardly_rad_s
-            ):
-                self.violated(
-                    "no siderostat is driven beyond its travel",
-                    f"{name}: {rad_s:.2f} rad/s at {position_rad:.2f} rad, at most {most_rad:.2f} rad",
-                )
-
-    def _stands_by(self, name: str, since_s: float, velocity_rad_s: AzEl) -> None:
-        """In STANDBY a siderostat moves only where a jog has sent it, or back to where it was held."""
-        line = self._lines[f"{name} siderostat"]
-        moves_s = max(since_s, self._jogged_s.get(name, 0.0), line.healed_s, self._stall_ended_s)
-        rested_s = self._clock.now_s() - moves_s
-        # Motors that do not move are commanded on, until the servo notices.
-        if not line.is_bad and not line.wrong and rested_s > self._moved_s[name]:
-            self.violated(
-                "a siderostat that nobody moves stands still in STANDBY",
-                f"{name}: {velocity_rad_s} rad/s {rested_s:.3f} s after it was moved",
-            )
-
-    def pose(self, pose: Pose, velocity_mm_s: float) -> None:
-        """A pose is sent to the hexapod, and how fast it is to go there."""
-        collector = self._rig.collector
-        if collector is None:
-            return
-        hexapod = collector.hexapod
-        if not velocity_mm_s <= hexapod.velocity_limit_mm_s * _SLACK:
-            self.violated("the hexapod's velocity within its limit", f"{velocity_mm_s} mm/s")
-        for axis, value, (low, high) in zip(Pose._fields, pose, hexapod.travel.ends, strict=True):
-            if not low <= value <= high:
-                self.violated("the hexapod's poses within its travel", f"{axis} {value}")
-
     def powered_unread(self, name: str) -> None:
         """Motors are given power, and nobody has read where they are."""
         self.violated("encoders are read before motors have power", name)
-
-    def volts(self, name: str, volts: Floats, before_v: Floats) -> None:
-        """Voltages are sent to a loop's mirror, whose D/A has others until they arrive."""
-        fsm = self._stellar_loops[name].fsm
-        wanted_v = volts.tolist()  # floats, for arrays of three take ten times as long
-        full_scale_v = fsm.dac.full_scale_v
-        if not all(0.0 <= volt <= full_scale_v for volt in wanted_v):
-            self.violated("voltages within their limits", f"{name}: {volts} V")
-        if self._supervisor is None:
-            return
-        # The first write in a mode was decided in the one before.
-        loop = self._supervisor.loops[name]
-        slowly = loop.mode in _SLOWLY
-        was_slow, self._slowly[name] = self._slowly.get(name, False), slowly
-        if not (slowly and was_slow):
-            return
-        step_v = max(abs(v - b) for v, b in zip(wanted_v, before_v.tolist(), strict=True))
-        most_v = fsm.slew_v_per_s * self._rig.camera.period_s * _SLACK + fsm.dac.step_v
-        if not step_v <= most_v:
-            self.violated(
-                "the mirror rests no faster than its slew",
-                f"{name}: {step_v:.3f} V in one write, at most {most_v:.3f} V",
-            )
-        if step_v > fsm.dac.step_v:
-            self._mirror_rests(name, loop, step_v)
-
-    def _mirror_rests(self, name: str, loop: Loop, step_v: float) -> None:
-        """At rest a mirror moves to its bias, and again after its D/A has moved it or was silent."""
-        fsm, line = self._stellar_loops[name].fsm, self._lines[f"{name} D/A"]
-        moves_s = max(
-            loop.mode_since_s,
-            line.healed_s,
-            self._stall_ended_s,
-            self._mirror_moved_s.get(name, 0.0),
-        )
-        rested_s = self._clock.now_s() - moves_s
-        if (
-            loop.mode in _SLOWLY
-            and not line.is_bad
-            and not line.wrong
-            and rested_s > fsm.dac.full_scale_v / fsm.slew_v_per_s + _MIRROR_RESTS_S
-        ):
-            self.violated(
-                "a mirror at rest stays where it is",
-                f"{name}: {step_v:.3f} V in one write after {rested_s:.2f} s in {loop.mode.name}",
-            )
-
-    def mirror_moved(self, name: str) -> None:
-        """A loop's D/A has gone to its safe voltages by itself, or somebody commands another bias."""
-        self._mirror_moved_s[name] = self._clock.now_s()
 
     def closed(self, reached: set[str]) -> None:
         """A supervisor has ended in good order: no amplifiers keep power that it had reached until then."""
@@ -661,8 +563,19 @@ class Invariants:
             self._power(name, loop.mode, busy=jobs.busy, now_s=now_s)
             self._safe_in_time(name, loop.mode, now_s)
             self._turns(name, loop.mode, now_s)
+            self.motion.stands(name, loop, now_s)
             self._experiments(name, loop.mode, now_s)
         self._collector_rests(now_s)
+        self._sequence_ends(supervisor, now_s)
+
+    def _sequence_ends(self, supervisor: Supervisor, now_s: float) -> None:
+        """A sequence that somebody orders to end does so."""
+        status = supervisor.sequences.status() if self._ended_run else None
+        goes_on = status is not None and status.run == self._ended_run
+        goes_on = goes_on and status.state in {"running", "paused"}  # type: ignore[union-attr]
+        lasted_s = self._ending.lasted_s("", is_so=goes_on, now_s=now_s)
+        if lasted_s > _SEQUENCE_ENDS_S:
+            self.violated("a sequence that is ordered to end does so", f"not in {lasted_s:.1f} s")
 
     def _safe_in_time(self, name: str, mode: Mode, now_s: float) -> None:
         """A loop with a device that has been silent, or has reported a fault, for long is in SAFE or OFF."""

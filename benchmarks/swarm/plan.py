@@ -74,11 +74,13 @@ _AT_TIMES, _LASTS_LONGER = 0.3, 5.0  # fraction of faults that meet only some ca
 _ONCE, _LAST_CALL = 0.3, 40  # fraction of these that meet a single call, one of the next so many
 _WRONG_RAD = -1.5, 0.7  # powers of ten of what an encoder is wrong by
 _AT_ONCE_S = 0.004  # mean delay between hurried commands
+_ALONE = 0.3  # fraction of stalls in which the other processes go on
 _LONG_STALL, _SILENT = 0.3, 0.5  # fractions of disturbed rests
 _LEARNER, _LEARNS = 0.4, 0.5  # fraction of runs with a learner, and of these, with `learn = "on"`
 _REPORTS_S = 5.0  # mean time between a learner's reports
 _EXPERIMENTS = 0.4  # fraction of runs with faults in which experiments are met by something
 _COLLECTOR = 0.4  # fraction of the testbed's runs in which its collector is moved on purpose
+_LOOP_FAILS = 0.3  # fraction of these in which a loop fails, in place of a stop
 _REFERENCED_S = 7.0  # until a reference move has ended
 _BURST, _BURST_S = 0.4, 0.05  # fraction of happenings that follow another at once, and mean delay
 
@@ -134,9 +136,15 @@ class Strike(_Happening, frozen=True, kw_only=True, tag="strike"):
 
 
 class Stall(_Happening, frozen=True, kw_only=True, tag="stall"):
-    """The whole machine stalls for a time."""
+    """The whole machine stalls for a time, or the supervisor's process `alone`."""
 
     lasts_s: float
+    alone: bool = False
+
+    @property
+    def kind(self) -> str:
+        """The name used in the statistics."""
+        return "stall of the supervisor" if self.alone else "stall"
 
 
 class Kill(_Happening, frozen=True, kw_only=True, tag="kill"):
@@ -476,20 +484,25 @@ def _met_experiment(
 
 
 def _moved_collector(random: Random, at_s: float, loops: tuple[str, ...]) -> list[Happening]:
-    """The collector is referenced and started, and stopped soon after, or at once."""
+    """The collector is referenced and started, and stopped soon after or at once, or a loop fails meanwhile."""
     who, begins_s = OPERATORS[0], at_s + _REFERENCED_S
     delay_s = random.expovariate(1 / _BURST_S) if random.random() < _BURST else random.uniform(0, 5)
     stops = (MoveCollector(action="stop"), Stop(), Stop(loop=random.choice(loops)))
+    ends: Happening = Order(at_s=begins_s + delay_s, who=who, command=random.choice(stops))
+    if random.random() < _LOOP_FAILS:
+        failing = f"{random.choice(loops)} siderostat"
+        ends = Strike(at_s=begins_s + delay_s, device=failing, fault="trip")
     return [
         Order(at_s=at_s, who=who, command=MoveCollector(action="reference")),
         *([Order(at_s=at_s, who=who, command=Stop())] if random.random() < _BURST else []),
         Order(at_s=begins_s, who=who, command=MoveCollector(action="start")),
-        Order(at_s=begins_s + delay_s, who=who, command=random.choice(stops)),
+        ends,
     ]
 
 
 def _stall(random: Random, at_s: float) -> list[Happening]:
-    return [Stall(at_s=at_s, lasts_s=10 ** random.uniform(-2.5, 0.5))]
+    lasts_s, alone = 10 ** random.uniform(-2.5, 0.5), random.random() < _ALONE
+    return [Stall(at_s=at_s, lasts_s=lasts_s, alone=alone)]
 
 
 def _kill(random: Random, at_s: float) -> list[Happening]:

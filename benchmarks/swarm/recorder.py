@@ -225,9 +225,14 @@ class SwarmRecorder:
         """How many of the first so many records still wait to be written."""
         return sum(1 for sequence, _ in self._queue._kept if sequence < offered)
 
-    def unaccounted(self) -> str:
-        """Report records that are neither written, waiting nor counted as lost; empty without any."""
+    def unaccounted(self, made: int) -> str:
+        """Report records that are neither written, waiting nor counted as lost; empty without any.
+
+        `made` is how many the supervisor has made.
+        """
         queue = self._queue
+        if queue.offered != made:
+            return f"{made} were made, {queue.offered} counted"
         waiting = {sequence for sequence, _ in queue._kept}
         missing = queue.offered - len(self.written | waiting)
         if missing == queue.lost:

@@ -20,6 +20,8 @@ import numpy as np
 
 from benchmarks.swarm.clients import Console, Link, RunningSequence
 from benchmarks.swarm.commands import MOST_RATE_S
+from benchmarks.swarm.computer import Computer
+from benchmarks.swarm.computer import installed as computer_installed
 from benchmarks.swarm.devices.amplifiers import SwarmAmplifiers
 from benchmarks.swarm.devices.hexapod import SwarmHexapod
 from benchmarks.swarm.devices.mirror import SwarmDac, SwarmPiezo
@@ -66,6 +68,7 @@ from fitctl.messages.commands import (
     Recover,
     Reply,
     SetTarget,
+    Shutdown,
     Standby,
     Stop,
     TakeOver,
@@ -86,6 +89,7 @@ _ANSWER_S = 5.0
 _ANSWERED_AT_THE_END_S = 1.5
 _WIND_DOWN_S = 1.0  # as fitctl.daemon.run
 _START_S = 2.0
+_SHUT_DOWN_S = 50.0  # with closing, the service's end and the last records
 _CLOSING_S = 31.0  # the supervisor waits 30 s for its devices
 _SEQUENCE_ENDS_S = 15.0
 _MOST_DESIGN_S = 20.0
@@ -152,6 +156,8 @@ class Instrument:
         Whose threads are installed.
     subscribers : list of Subscriber
         Sockets of the consoles that are far away.
+    computer : Computer
+        Which is installed.
     on_record : callable, optional
         Takes every record.
     """
@@ -162,10 +168,12 @@ class Instrument:
         plan: Plan,
         time: VirtualTime,
         subscribers: list[Subscriber],
+        computer: Computer,
         on_record: Callable[[AnyRecord], None] = lambda _: None,
     ) -> None:
         self.rig = rig
         self.time = time
+        self._computer = computer
         self.plant = Plant(rig, [plan.seed], history_s=_HISTORY_S)
         self.plant.advance(self.plant.step_s)
         self.subscribers = subscribers
@@ -187,7 +195,7 @@ class Instrument:
         self._posted = 0
         self._places: list[StarPlace] = []
         self._lives = 0
-        self._disk_is_full = self._is_healed = False
+        self._is_healed = False
         self._recorder_stuck_until_s = 0.0
         self._sequences: list[RunningSequence] = []
         self.found_s: dict[
@@ -208,7 +216,7 @@ class Instrument:
         hexapod = None
         if rig.collector is not None:
             hexapod = self.invariants.hexapod = SwarmHexapod(
-                self.plant, time, rig, self._random("hexapod"), self.invariants.pose
+                self.plant, time, rig, self._random("hexapod"), self.invariants.motion.pose
             )
             self._add("hexapod", hexapod)
         self.devices = Devices(self.camera, loops, hexapod)
@@ -229,7 +237,7 @@ class Instrument:
             rig,
             name,
             random,
-            self.invariants.velocity,
+            self.invariants.motion.velocity,
             self.invariants.powered_unread,
             self.invariants.encoders_read,
         )
@@ -243,7 +251,7 @@ class Instrument:
             self._add(f"{name} photodiodes", photodiodes)
             return LoopDevices(amplifiers, photodiodes=photodiodes, bus=bus)
         mirror = SimulatedMirror(part, time, rig, name)  # type: ignore[arg-type]
-        written, made_safe = self.invariants.volts, self.invariants.mirror_moved
+        written, made_safe = self.invariants.motion.volts, self.invariants.motion.mirror_moved
         dac = SwarmDac(mirror, time, rig, name, random, written, made_safe)
         piezo = SwarmPiezo(mirror, time, rig, name, random)
         self._add(f"{name} D/A", dac)
@@ -257,6 +265,7 @@ class Instrument:
         self.time.new_process()
         self._unanswered.clear()
         self._lives += 1
+        self._records, self._shutdown_awake_s = 0, math.inf
         size = self.rig.logging.queue_records
         self._queue = RecordQueue("swarm", size)
         self.recorder = SwarmRecorder(self.time, self._queue)
@@ -287,6 +296,11 @@ class Instrument:
             lambda: queue.offered,
         )
         self._console.connect(self.service, self.supervisor)
+        self._machine = self._computer.machine_of(
+            self.supervisor,
+            lambda: queue.waiting / self.rig.logging.queue_records,
+            self.invariants.violated,
+        )
         self._threads = [PeriodicThread(work, self.time) for work in self.supervisor.periodic]
         for thread in self._threads:
             thread.start()
@@ -295,6 +309,7 @@ class Instrument:
     def kill(self, back_after_s: float) -> None:
         """The supervisor's process is gone, and a new one comes."""
         if self.running:
+            self.account_for_records()
             self.time.kill_process()
             saved_s = self.time.now_s() - 2 * _SAVED_S
             self.found_s = {name: at_s for name, at_s in self.found_s.items() if at_s < saved_s}
@@ -347,10 +362,8 @@ class Instrument:
         queue, supervisor = self._queue, self.supervisor
         queue.pump()
         self._places = supervisor.star_places
-        taken = queue.waiting / self.rig.logging.queue_records
-        supervisor.report_quantity("recorder_backlog_fraction", taken)
-        supervisor.report_quantity("disk_free_bytes", 0.0 if self._disk_is_full else 1e12)
-        self.recorder.disk_is_full = self._disk_is_full
+        self._machine.look()
+        self.recorder.disk_is_full = self._computer.disk_is_full
 
     def _finish_log(self) -> None:
         self.account_for_records()
@@ -360,7 +373,7 @@ class Instrument:
 
     def account_for_records(self) -> None:
         """Every record is written, or waits, or was counted."""
-        wrong = self.recorder.unaccounted()
+        wrong = self.recorder.unaccounted(self._records)
         if wrong:
             self.invariants.violated("a record is written or counted", wrong)
 
@@ -390,6 +403,7 @@ class Instrument:
 
     def _record(self, record: AnyRecord) -> None:
         self._digest.update(self._encode(record))
+        self._records += 1
         self._queue.offer(record)
         if self.service is not None:
             self.service.take(record)
@@ -431,6 +445,8 @@ class Instrument:
         if self._unanswered.pop(number, None) is None:
             name = type(command).__name__
             self.invariants.violated(ANSWERED_ONCE, f"{name} {number}: twice")
+        if isinstance(command, Shutdown) and reply.accepted:
+            self._shutdown_awake_s = min(self._shutdown_awake_s, self.time.awake_s())
 
     def lead_on(self, who: str, *, from_zero: bool = False) -> None:
         """Give the command that leads every loop on towards its star; `from_zero`, sought about there."""
@@ -459,6 +475,8 @@ class Instrument:
         for since_s, awake_s, name in self._unanswered.values():
             if now_s - awake_s > within_s:
                 self.invariants.violated(ANSWERED_ONCE, f"{name} of {since_s:.3f} s never was")
+        if self.running and now_s - self._shutdown_awake_s > _SHUT_DOWN_S:
+            self.invariants.violated("a shutdown ends the supervisor", f"not in {_SHUT_DOWN_S:g} s")
 
     # ------------------------------------------------------------ what happens
 
@@ -472,7 +490,7 @@ class Instrument:
             case Order(command=command) if command is not None:
                 self.give(happening.who, command)
             case Stall():
-                self.invariants.stalled(*self.time.stall(happening.lasts_s))
+                self.invariants.stalled(*self.time.stall(happening.lasts_s, alone=happening.alone))
             case Kill():
                 self.kill(happening.back_after_s)
             case RecorderDeath():
@@ -482,10 +500,10 @@ class Instrument:
                 self._recorder_stuck_until_s = max(self._recorder_stuck_until_s, until_s)
                 self.recorder.stuck_until_s = self._recorder_stuck_until_s
             case FullDisk():
-                self._disk_is_full = True
+                self._computer.disk_is_full = True
                 self.time.call_at(self.time.now_s() + happening.lasts_s, self._empty_disk)
             case ClockStep():
-                self.supervisor.report_quantity("clock_step_s", happening.by_s)
+                self._computer.wall_s += happening.by_s
             case Sequence():
                 self._start_sequence(happening)
             case Cloud():
@@ -496,6 +514,7 @@ class Instrument:
 
     def _strike(self, strike: Strike, loop_name: str) -> None:
         """Let a fault begin; one with a duration ends after it. `loop_name` is that of a siderostat."""
+        self.invariants.struck(strike.device)
         match strike.fault:
             case "reset":
                 self.resets[strike.device]()
@@ -539,7 +558,7 @@ class Instrument:
         return motor_sky_rad_per_rad(self.rig.loops[name].siderostat) * ARCSEC_PER_RAD
 
     def _empty_disk(self) -> None:
-        self._disk_is_full = False
+        self._computer.disk_is_full = False
 
     def _start_sequence(self, happening: Sequence) -> None:
         violated = self.invariants.violated
@@ -597,6 +616,7 @@ def _run(plan: Plan, on_record: Callable[[AnyRecord], None], began_s: float) -> 
     rig = load_rig(RIGS / plan.rig, plan.settings)
     time = VirtualTime()
     random = Random(f"{plan.seed} subscribers")  # noqa: S311 - a repeatable draw
+    computer = Computer()
     subscribers = drawn_subscribers(time, random, plan.remote_consoles)
     with (
         installed(time),
@@ -604,10 +624,11 @@ def _run(plan: Plan, on_record: Callable[[AnyRecord], None], began_s: float) -> 
         patch("fitctl.logging.queue.time", SimpleNamespace(monotonic=time.now_s)),
         patch("fitctl.daemon.last_records.time", SimpleNamespace(monotonic=time.now_s)),
         client_installed(time, subscribers),
+        computer_installed(time, computer),
         service_installed(time, Random(f"{plan.seed} service")),  # noqa: S311
     ):
         try:
-            instrument = Instrument(rig, plan, time, subscribers, on_record)
+            instrument = Instrument(rig, plan, time, subscribers, computer, on_record)
             for happening in plan.happenings:
                 time.call_at(happening.at_s, partial(instrument.happen, happening))
             end_s = 0.0

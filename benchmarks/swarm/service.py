@@ -169,7 +169,7 @@ class _WatchedAdmission(Admission):
         refusal = super().refusal(sender, command, now_s)
         self._invariants.admitted(sender, command, refusal)
         if not refusal and not isinstance(command, _ANSWERED_HERE):
-            self._invariants.posted(command)
+            self._invariants.posted(command, sender.name)
         return refusal
 
 
@@ -230,6 +230,15 @@ class SwarmService(Service):
         self.newest: dict[tuple[type, str], AnyRecord] = {}
         self.subscribers: list[Callable[[Telemetry], None]] = []
         super().__init__(supervisor, self.buffer, Path(), state, time)
+        post = supervisor.post
+
+        def watched_post(
+            command: AnyCommand, reply: Callable[[Reply], None], sender: str, address: str
+        ) -> None:
+            invariants.obeyed(command, sender)
+            post(command, reply, sender, address)
+
+        supervisor.post = watched_post  # type: ignore[assignment,method-assign]
         self._admission = _WatchedAdmission(supervisor.rig.service.lease_s, invariants)
         publisher.supervisor = supervisor
         self._publisher = publisher  # type: ignore[assignment]

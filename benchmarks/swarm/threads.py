@@ -8,6 +8,7 @@ microsecond, and the order of everything depends on nothing but the deadlines.
 from __future__ import annotations
 
 import heapq
+import math
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future
@@ -20,6 +21,7 @@ from unittest.mock import patch
 from greenlet import GreenletExit, getcurrent, greenlet
 
 _WITH_THREADS = (
+    "fitctl.daemon.machine",
     "fitctl.service.service",
     "fitctl.supervisor.collector",
     "fitctl.stages.collector",
@@ -57,7 +59,7 @@ class VirtualTime:
         self._threads: list[greenlet] = []
         self._killed: set[greenlet] = set()
         self._process: list[greenlet] = []
-        self._stalled_until_s = self._stalled_s = 0.0
+        self._stalled_until_s = self._stalled_s = self._all_stalled_until_s = 0.0
         self._over = False
 
     # ------------------------------------------------------------ the clock
@@ -125,16 +127,21 @@ class VirtualTime:
         """No thread of the process ever goes on."""
         self._killed.update(self._process)
 
-    def stall(self, duration_s: float) -> tuple[float, float]:
+    def stall(self, duration_s: float, *, alone: bool = False) -> tuple[float, float]:
         """No thread goes on for a while, as on a machine that stands still; what is no thread does.
+
+        If the process stands still `alone`, the threads of other processes go on.
 
         Returns
         -------
         tuple of float
-            Until when it stands still, and by how much that is longer than before.
+            Until when the process stands still, and by how much that is longer than before.
         """
         before_s = max(self._stalled_until_s, self._now_s)
-        self._stalled_until_s = max(before_s, self._now_s + duration_s)
+        until_s = self._now_s + duration_s
+        self._stalled_until_s = max(before_s, until_s)
+        if not alone:
+            self._all_stalled_until_s = max(self._all_stalled_until_s, until_s)
         added_s = self._stalled_until_s - before_s
         self._stalled_s += added_s
         return self._stalled_until_s, added_s
@@ -142,10 +149,10 @@ class VirtualTime:
     @property
     def goes_on_s(self) -> float:
         """When a machine that stands still goes on; now, if it does not."""
-        return max(self._now_s, self._stalled_until_s)
+        return max(self._now_s, self._all_stalled_until_s)
 
     def awake_s(self) -> float:
-        """For how long the machine has not stood still."""
+        """For how long the process has not stood still."""
         still_s = max(0.0, self._stalled_until_s - self._now_s)
         return self._now_s - (self._stalled_s - still_s)
 
@@ -180,14 +187,12 @@ class VirtualTime:
             run = due.run
             if run is None or run in self._killed:
                 continue
-            if (
-                time_s < self._stalled_until_s
-                and isinstance(run, greenlet)
-                and run is not self._hub
-            ):
-                self._number += 1
-                heapq.heappush(self._due, (self._stalled_until_s, self._number, due))
-                continue
+            if time_s < self._stalled_until_s and isinstance(run, greenlet):
+                until_s = self._stands_still_until_s(run)
+                if time_s < until_s:
+                    self._number += 1
+                    heapq.heappush(self._due, (until_s, self._number, due))
+                    continue
             due.fired = True
             if time_s > self._now_s:  # noqa: PLR1730
                 self._now_s = time_s
@@ -201,6 +206,11 @@ class VirtualTime:
                     raise GreenletExit
                 return
             self._call(run)
+
+    def _stands_still_until_s(self, thread: greenlet) -> float:
+        if thread is self._hub:
+            return -math.inf
+        return self._stalled_until_s if thread in self._process else self._all_stalled_until_s
 
     def _call(self, function: Callable[[], None]) -> None:
         """Call what was due. What it raises must not reach the thread that happens to switch."""

@@ -22,7 +22,16 @@ from fitctl.drivers.interface import Pose
 from fitctl.logging.records import ModeChange
 from fitctl.loop.learning import Learning
 from fitctl.loop.stellar import StellarLoop
-from fitctl.messages.commands import Experiment, Jog, MoveCollector, Release, Reply, Standby, Stop
+from fitctl.messages.commands import (
+    Experiment,
+    Jog,
+    MoveCollector,
+    Release,
+    Reply,
+    SequenceControl,
+    Standby,
+    Stop,
+)
 from fitctl.messages.modes import Mode
 from fitctl.model.drives import standstill
 from fitctl.model.plant import Plant
@@ -35,6 +44,12 @@ TESTBED = "fit-testbed.toml"
 TICK_S = 0.1
 
 
+def named(device):
+    """As a device's errors name it."""
+    kind = device.rpartition(" ")[2]
+    return "piezo amplifier" if kind == "piezo" else kind
+
+
 class Rig:
     """Invariants over stand-ins of a supervisor, of amplifiers and of lines that are all connected."""
 
@@ -42,7 +57,8 @@ class Rig:
         self.rig = load_rig(FOLDER / rig)
         self.time = VirtualTime()
         self.lines = {
-            name: Line(name, "", self.time, Random(1), 0.001, 0.1) for name in devices_of(rig)
+            name: Line(named(name), "", self.time, Random(1), 0.001, 0.1)
+            for name in devices_of(rig)
         }
         for line in self.lines.values():
             line.connected = True
@@ -62,12 +78,23 @@ class Rig:
         self.jobs = SimpleNamespace(busy=False)
         self.servo = SimpleNamespace(_wanted_rad=(0.0, 0.0), position_rad=(0.0, 0.0))
         self.loops = {
-            name: SimpleNamespace(mode=mode, mode_since_s=0.0, servo=self.servo)
+            name: SimpleNamespace(
+                mode=mode,
+                mode_since_s=0.0,
+                servo=self.servo,
+                mirror=SimpleNamespace(command_rad=np.zeros(2)),
+            )
             for name in self.rig.loops
         }
         self.invariants = Invariants(self.rig, self.time, self.amplifiers, self.lines, self.plant)
-        supervisor = SimpleNamespace(loops=self.loops, _device_jobs=self.jobs, piezos={})
-        self.invariants.watch(supervisor)
+        self.supervisor = SimpleNamespace(
+            loops=self.loops,
+            stellar_loops=self.loops,
+            _device_jobs=self.jobs,
+            piezos={},
+            sequences=SimpleNamespace(),
+        )
+        self.invariants.watch(self.supervisor)
 
     def go_on(self, seconds):
         """Tick for a while; return what was violated until now."""
@@ -204,9 +231,24 @@ def test_no_motor_that_is_beyond_its_travel_is_driven_farther(
     watched = Rig()
     watched.plant.loops["right"].state.motor_rad[0] = 0.0, motor_rad
     watched.amplifiers["right"].zero_rad = 0.0, zero_rad
-    watched.invariants.velocity("right", (0.0, velocity_rad_s))
+    for rad_s in np.linspace(0.0, velocity_rad_s, 11):  # as fast as it may accelerate
+        watched.invariants.motion.velocity("right", (0.0, rad_s))
 
     assert watched.go_on(0.1) == violated
+
+
+def test_a_velocity_changes_no_faster_than_a_motor_may_accelerate_but_for_a_stop():
+    watched = Rig()
+    siderostat = watched.rig.loops["right"].siderostat
+    step_rad_s = siderostat.acceleration_limit_rad_s2 / siderostat.servo.rate_hz
+    send = watched.invariants.motion.velocity
+    for number in range(5):
+        send("right", (number * step_rad_s, 0.0))
+    send("right", (0.0, 0.0))
+    assert watched.go_on(0.1) == []
+
+    send("right", (0.0, 1.1 * step_rad_s))
+    assert watched.go_on(0.1) == ["acceleration within its limit"]
 
 
 # ------------------------------------------------------------ rest
@@ -232,19 +274,27 @@ def test_a_drive_that_watches_nobody_turns_on_while_it_cannot_be_reached():
 MOVES = ["a siderostat that nobody moves stands still in STANDBY"]
 
 
+def turn(watched, turned_rad=0.01):
+    """Turn a motor that stood still."""
+    watched.go_on(0.1)
+    watched.plant.loops["right"].state.motor_rad[0, 0] += turned_rad
+
+
 def test_a_siderostat_moves_in_standby_only_after_a_jog():
     watched = Rig(mode=Mode.STANDBY)
     watched.go_on(10.0)
     jog = Jog(az_sky_arcsec=10.0, el_sky_arcsec=0.0)
-    watched.invariants.posted(jog)
-    watched.invariants.velocity("right", (5.0, 0.0))
+    watched.invariants.posted(jog, "ada")
+    turn(watched)
     watched.go_on(1.0)
     watched.invariants.answered(jog, Reply(accepted=True))
     watched.go_on(2.0)
-    watched.invariants.velocity("right", (5.0, 0.0))
-    assert watched.go_on(3.0) == []
+    turn(watched)
+    assert watched.go_on(5.0) == []
 
-    watched.invariants.velocity("right", (5.0, 0.0))
+    turn(watched, turned_rad=1e-4)  # no more than its encoder counts
+    assert watched.go_on(0.1) == []
+    turn(watched)
     assert watched.go_on(0.1) == MOVES
 
 
@@ -253,9 +303,10 @@ def test_in_standby_a_servo_may_go_back_to_where_it_was_after_a_fault():
     line = watched.lines["right siderostat"]
     watched.go_on(10.0)
     line.faults["slow"] = 10.0
-    watched.invariants.velocity("right", (5.0, 0.0))
+    turn(watched)
+    watched.go_on(0.1)
     line.heal()
-    watched.invariants.velocity("right", (5.0, 0.0))
+    turn(watched)
 
     assert watched.go_on(0.1) == []
 
@@ -264,7 +315,7 @@ def test_motors_that_are_stuck_are_commanded_in_standby():
     watched = Rig(mode=Mode.STANDBY)
     watched.go_on(10.0)
     watched.lines["right siderostat"].wrong["stuck"] = 0.0
-    watched.invariants.velocity("right", (5.0, 0.0))
+    turn(watched)
 
     assert watched.go_on(0.1) == []
 
@@ -308,7 +359,7 @@ def test_an_axis_may_be_called_stuck_only_if_it_is(wrong, violated):
 def test_the_hexapod_is_sent_nothing_beyond_its_limits(pose, velocity_mm_s, violated):
     watched = Rig(TESTBED)
     hexapod = SwarmHexapod(
-        watched.plant, watched.time, watched.rig, Random(1), watched.invariants.pose
+        watched.plant, watched.time, watched.rig, Random(1), watched.invariants.motion.pose
     )
     hexapod.line.connected = True
     watched.time.spawn(lambda: hexapod.move_to(pose, velocity_mm_s), "moves")
@@ -460,7 +511,7 @@ def swings(watched, seconds):
     low_v, high_v = np.full(3, 5.0), np.full(3, 5.2)
     for _ in range(round(seconds / TICK_S)):
         watched.go_on(TICK_S)
-        watched.invariants.volts("right", high_v, low_v)
+        watched.invariants.motion.volts("right", high_v, low_v)
         low_v, high_v = high_v, low_v
     return [one.invariant for one in watched.invariants.violations]
 
@@ -473,10 +524,110 @@ def test_a_mirror_that_swings_at_rest_is_noticed(mode):
     assert swings(watched, 0.5) == ["a mirror at rest stays where it is"]
 
 
+@pytest.mark.parametrize("since_s", [0.0005, 0.02])
+@pytest.mark.parametrize("mode", [Mode.SAFE, Mode.STANDBY, Mode.VERNIER])
+def test_the_first_write_at_rest_is_within_the_slew_if_it_was_decided_there(since_s, mode):
+    watched = Rig(mode=mode)
+    watched.go_on(5.0)
+    watched.loops["right"].mode_since_s = watched.time.now_s() - since_s
+    watched.invariants.motion.volts("right", np.full(3, 7.0), np.full(3, 5.0))
+
+    jumps = since_s > 0.001 and mode is not Mode.VERNIER
+    assert watched.go_on(0.1) == ["the mirror rests no faster than its slew"] * jumps
+
+
+@pytest.mark.parametrize(
+    ("part", "violated"), [(0.99, []), (1.01, ["the mirror stays within its range"])]
+)
+@pytest.mark.parametrize("direction", [(1.0, 0.0), (0.5, -0.5)])
+def test_a_mirror_that_points_stays_within_its_diamond(part, violated, direction):
+    watched = Rig(mode=Mode.VERNIER)
+    watched.go_on(5.0)
+    fsm = watched.rig.stellar_loops["right"].fsm
+    watched.loops["right"].mirror.command_rad = part * fsm.range_rad * np.array(direction)
+    watched.invariants.motion.volts("right", np.full(3, 5.0), np.full(3, 5.0))
+
+    assert watched.go_on(0.1) == violated
+
+
+NO_CAUSE = ["without a fault nothing fails"]
+
+
+@pytest.mark.parametrize(
+    ("rig", "struck", "reason", "violated"),
+    [
+        ("two-stars.toml", "right D/A", "D/A at 127.0.0.1:1: no answer", []),
+        ("two-stars.toml", "right piezo", "D/A at 127.0.0.1:1: no answer", NO_CAUSE),
+        ("two-stars.toml", "left D/A", "D/A at 127.0.0.1:1: no answer", NO_CAUSE),
+        ("two-stars.toml", "left D/A", "interlock flux_low: too dim", []),
+        (TESTBED, "metrology siderostat", "siderostat right at can0: no answer", NO_CAUSE),
+    ],
+)
+def test_what_fails_has_its_cause_in_its_own_devices(rig, struck, reason, violated):
+    watched = Rig(rig)
+    watched.go_on(60.0)
+    watched.invariants.violations.clear()
+    watched.invariants.struck(struck)
+    watched.go_on(1.0)
+    change = ModeChange(
+        time_s=watched.time.now_s(),
+        loop="right",
+        source="VERNIER",
+        target="SAFE",
+        target_number=5,
+        trigger="FAULT",
+        reason=reason,
+    )
+    watched.invariants.record(change)
+
+    found = [one.invariant for one in watched.invariants.violations]
+    assert [one for one in found if one.startswith("without")] == violated
+
+
+def test_the_left_star_of_the_testbed_may_fail_with_its_link():
+    watched = Rig(TESTBED)
+    watched.go_on(60.0)
+    watched.invariants.struck("metrology siderostat")
+
+    reason = "siderostat metrology at can0: no answer"
+    assert watched.invariants._has_cause("left", reason)
+    assert not watched.invariants._has_cause("right", reason)
+
+
+def test_only_what_was_admitted_may_be_passed_on_and_once():
+    watched = Rig()
+    command = Standby()
+    watched.invariants.posted(command, "ada")
+    watched.invariants.obeyed(command, "ada")
+    assert watched.go_on(0.1) == []
+
+    watched.invariants.obeyed(command, "ada")
+    assert watched.go_on(0.1) == ["lease and rights are kept"]
+
+
+@pytest.mark.parametrize(
+    ("run", "state", "violated"),
+    [
+        ("first", "running", ["a sequence that is ordered to end does so"]),
+        ("first", "stopped", []),
+        ("second", "running", []),
+    ],
+)
+def test_a_sequence_that_is_ordered_to_end_must(run, state, violated):
+    watched = Rig()
+    sequences = watched.supervisor.sequences
+    sequences.status = lambda: SimpleNamespace(run="first", state="running")
+    watched.invariants.answered(SequenceControl(action="end"), Reply(accepted=True))
+    assert watched.go_on(14.0) == []
+
+    sequences.status = lambda: SimpleNamespace(run=run, state=state)
+    assert watched.go_on(3.0) == violated
+
+
 def test_a_mirror_may_go_back_to_its_bias_after_its_dac_has_moved_it():
     watched = Rig(mode=Mode.SAFE)
     watched.go_on(5.0)
-    watched.invariants.mirror_moved("right")
+    watched.invariants.motion.mirror_moved("right")
 
     assert swings(watched, 1.0) == []
 

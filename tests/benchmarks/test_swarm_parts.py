@@ -113,7 +113,7 @@ def test_a_recorder_that_dies_loses_nothing_that_was_not_confirmed(time, queue):
         time.run_until(time.now_s() + 0.2)
 
     assert recorder.written == set(range(42))
-    assert recorder.unaccounted() == ""
+    assert recorder.unaccounted(queue.offered) == ""
 
 
 def test_what_a_full_disk_keeps_out_is_counted(time, queue):
@@ -124,7 +124,7 @@ def test_what_a_full_disk_keeps_out_is_counted(time, queue):
         time.run_until(time.now_s() + 1.0)
 
     assert queue.lost > 0
-    assert recorder.unaccounted() == ""
+    assert recorder.unaccounted(queue.offered) == ""
 
 
 def test_a_record_that_nobody_counts_is_noticed(time, queue):
@@ -135,7 +135,7 @@ def test_a_record_that_nobody_counts_is_noticed(time, queue):
         time.run_until(time.now_s() + 1.0)
     queue.lost = 0
 
-    assert "0 counted" in recorder.unaccounted()
+    assert "0 counted" in recorder.unaccounted(queue.offered)
 
 
 def test_a_recorder_that_is_stuck_writes_all_when_it_goes_on(time, queue):
