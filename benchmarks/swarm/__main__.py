@@ -302,7 +302,7 @@ def main() -> int:
         return past(options.past or list(DEFECTS), options.seed or 1, options.hours, options.jobs)
     if options.replay is not None:
         plan = plan_of(options.replay)
-        return replay(shrunk(plan) if options.shrink else plan)
+        return replay(shrunk(plan, _MOST_TRIALS) if options.shrink else plan)
     seed = options.seed if options.seed is not None else int.from_bytes(os.urandom(2))
     print(f"seed {seed}", file=sys.stderr)
     found = swarm(seed, options.hours, options.jobs)

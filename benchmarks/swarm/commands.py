@@ -33,7 +33,6 @@ from fitctl.messages.commands import (
 from fitctl.model.drives import FSM, SIDEROSTAT, STACKS, Channel, Drive
 
 MOST_RATE_S = 30.0  # of the camera at another rate
-_LONG_JOG = 0.1  # fraction of jogs
 _FAR, _FAR_ARCSEC = 0.4, 550.0  # fraction of searches elsewhere, and how far at most on each axis
 _LEARNT = {
     "coarse_per_s": 0.46,
@@ -72,13 +71,6 @@ def far_search(random: Random) -> Acquire:
     """A search far from the star's expected place."""
     az_arcsec, el_arcsec = (random.uniform(-_FAR_ARCSEC, _FAR_ARCSEC) for _ in range(2))
     return Acquire(expected_az_sky_arcsec=az_arcsec, expected_el_sky_arcsec=el_arcsec)
-
-
-def drawn_jog(random: Random) -> Jog:
-    """A short way, or a long one, to the end of the travel and beyond."""
-    most_arcsec = 1500.0 if random.random() < _LONG_JOG else 60.0
-    az_arcsec, el_arcsec = (random.uniform(-most_arcsec, most_arcsec) for _ in range(2))
-    return Jog(az_sky_arcsec=az_arcsec, el_sky_arcsec=el_arcsec)
 
 
 def drawn_target(random: Random) -> SetTarget:
@@ -140,7 +132,9 @@ COMMANDS: dict[str, Callable[[Random], AnyCommand | None]] = {
     "status": lambda _: Status(),
     "take-over": lambda _: TakeOver(),
     "target": drawn_target,
-    "jog": drawn_jog,
+    "jog": lambda random: Jog(
+        az_sky_arcsec=random.uniform(-60, 60), el_sky_arcsec=random.uniform(-60, 60)
+    ),
     "controller": lambda random: SetController(
         name=random.choice(("eq20", "minimum-variance", "learnt"))
     ),

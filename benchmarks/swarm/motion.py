@@ -16,7 +16,7 @@ from fitctl.config import Rig
 from fitctl.config.base import ARCSEC_PER_RAD
 from fitctl.drivers.interface import AzEl, Pose
 from fitctl.loop.loop import Loop
-from fitctl.messages.modes import WITH_WINDOW, Mode
+from fitctl.messages.modes import Mode
 from fitctl.model.optics import motor_sky_rad_per_rad
 from fitctl.model.plant import Plant
 from fitctl.supervisor.supervisor import Supervisor
@@ -86,6 +86,7 @@ class Motion:
         self._zero_is_lost = zero_is_lost
         self._mirror_moved_s: dict[str, float] = {}  # by loop: when something moved it that may
         self._sent_rad_s: dict[str, AzEl] = {}
+        self._slowly: dict[str, bool] = {}  # by loop: the last write was in a mode of rest
         self._standing_rad: dict[str, list[float]] = {}
         # What every period needs, once.
         self._stellar_loops = rig.stellar_loops
@@ -115,6 +116,7 @@ class Motion:
         self.supervisor = supervisor
         self.stopped_s.clear()
         self.jogged_s.clear()
+        self._slowly.clear()
         self._standing_rad.clear()
 
     def velocity(self, name: str, velocity_rad_s: AzEl) -> None:
@@ -218,11 +220,15 @@ class Motion:
         if self.supervisor is None:
             return
         loop = self.supervisor.loops[name]
-        if self._clock.now_s() - loop.mode_since_s < _DECIDED_S or not self._dacs_are_well():
-            return  # this write may have been decided in the mode before
-        if loop.mode in WITH_WINDOW:
+        # A write may have been decided in the mode before.
+        decided_here = (
+            self._clock.now_s() - loop.mode_since_s >= _DECIDED_S and self._dacs_are_well()
+        )
+        slowly = loop.mode in _SLOWLY
+        was_slow, self._slowly[name] = self._slowly.get(name, False), slowly
+        if loop.mode is Mode.VERNIER and decided_here:
             self._within_range(name, self.supervisor)
-        if loop.mode not in _SLOWLY:
+        if not (slowly and (was_slow or decided_here)):
             return
         step_v = max(abs(v - b) for v, b in zip(wanted_v, before_v.tolist(), strict=True))
         most_v = fsm.slew_v_per_s * self._rig.camera.period_s * _SLACK + fsm.dac.step_v
@@ -243,7 +249,10 @@ class Motion:
         return True
 
     def _within_range(self, name: str, supervisor: Supervisor) -> None:
-        """A loop that points the mirror by angles keeps it within its range, the diamond of Eq. 2."""
+        """In VERNIER a loop commands the mirror's angles, within its range, the diamond of Eq. 2.
+
+        In COARSE it goes to its bias by voltages, from where the model of its hysteresis has it.
+        """
         az_rad, el_rad = supervisor.stellar_loops[name].mirror.command_rad.tolist()
         range_rad = self._stellar_loops[name].fsm.range_rad
         if not abs(az_rad) + abs(el_rad) <= range_rad * _SLACK:

@@ -19,6 +19,7 @@ from benchmarks.swarm.lines import FAULTS, OF_SOME_CALLS, WRONG, drawn_slowness
 from benchmarks.swarm.rigs import FAST, RIGS, devices_of, drawn_settings, learning, stars_of
 from fitctl.messages.commands import (
     AnyCommand,
+    Jog,
     MoveCollector,
     Off,
     Release,
@@ -79,6 +80,8 @@ _LONG_STALL, _SILENT = 0.3, 0.5  # fractions of disturbed rests
 _LEARNER, _LEARNS = 0.4, 0.5  # fraction of runs with a learner, and of these, with `learn = "on"`
 _REPORTS_S = 5.0  # mean time between a learner's reports
 _EXPERIMENTS = 0.4  # fraction of runs with faults in which experiments are met by something
+_TO_THE_END = 0.1  # fraction of runs in which a siderostat is jogged to the end of its travel
+_JOG_ARCSEC, _JOGS = 100.0, 14  # each, and so many
 _COLLECTOR = 0.4  # fraction of the testbed's runs in which its collector is moved on purpose
 _LOOP_FAILS = 0.3  # fraction of these in which a loop fails, in place of a stop
 _REFERENCED_S = 7.0  # until a reference move has ended
@@ -342,6 +345,8 @@ def _drawn_strikes(random: Random, rig: str) -> list[Callable[[Random, float], l
         if random.random() < _EXPERIMENTS:
             met = partial(_met_experiment, loops=stars_of(rig), devices=struck, faults=faults)
             strikes += [met] * random.randint(1, 3)
+    if random.random() < _TO_THE_END:
+        strikes.append(partial(_jogged_to_the_end, loops=loops))
     if "metrology" in loops and random.random() < _COLLECTOR:
         strikes += [partial(_moved_collector, loops=loops)] * random.randint(1, 2)
     return strikes
@@ -459,6 +464,17 @@ def _disturbed_rest(random: Random, at_s: float, loops: tuple[str, ...]) -> list
         if command is not None
     ]
     return [*orders, *others]
+
+
+def _jogged_to_the_end(random: Random, at_s: float, loops: tuple[str, ...]) -> list[Happening]:
+    """A loop lets its star go, and its siderostat is jogged in one direction to the end of its travel."""
+    loop, who = random.choice(loops), OPERATORS[0]
+    az_arcsec, el_arcsec = (random.choice((-1, 0, 1)) * _JOG_ARCSEC for _ in range(2))
+    jog = Jog(loop=loop, az_sky_arcsec=az_arcsec, el_sky_arcsec=el_arcsec)
+    return [
+        Order(at_s=at_s, who=who, command=Release(loop=loop)),
+        *[Order(at_s=at_s + 0.2 * (1 + number), who=who, command=jog) for number in range(_JOGS)],
+    ]
 
 
 def _met_experiment(

@@ -316,6 +316,23 @@ def test_a_machine_that_stands_still_holds_every_thread_and_no_device(time):
     assert seen == [("device", 1.5), ("thread", 2.5)]
 
 
+def test_a_process_that_stands_still_alone_holds_its_own_threads(time):
+    seen = []
+
+    def waits(name):
+        time.sleep_until(1.0)
+        seen.append((name, time.now_s()))
+
+    time.new_process()
+    time.spawn(lambda: waits("its own"), "its own")
+    time.spawn(lambda: waits("another's"), "another's", apart=True)
+    time.call_at(0.5, lambda: time.stall(2.0, alone=True))
+    time.run_until(5.0)
+
+    assert seen == [("another's", 1.0), ("its own", 2.5)]
+    assert time.awake_s() == 3.0
+
+
 def test_the_threads_of_a_process_that_is_killed_never_go_on(time):
     seen = []
 

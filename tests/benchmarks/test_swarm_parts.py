@@ -64,6 +64,7 @@ from fitctl.sequences.contact import Contact
 from fitctl.sequences.steps import AnyStep
 from fitctl.service.admission import Admission
 from fitctl.stages.servo import SiderostatServo
+from fitctl.stages.siderostat import SiderostatStage
 from fitctl.tui.state import ConsoleState
 from tests.samples.log_samples import tick
 
@@ -536,6 +537,26 @@ def test_the_testbed_finds_its_star_though_the_collector_went_far_without_a_held
     )
 
     assert result.violations == []
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("part", "violated"), [(1.0, []), (1.05, ["no siderostat is driven beyond its travel"])]
+)
+def test_a_siderostat_that_is_jogged_to_the_end_stays_within_its_travel(
+    monkeypatch, part, violated
+):
+    made = SiderostatStage.__init__
+
+    def made_with_travel(self, *arguments):
+        made(self, *arguments)
+        self.travel_rad *= part
+
+    monkeypatch.setattr(SiderostatStage, "__init__", made_with_travel)
+    jogs = plans._jogged_to_the_end(Random(1), 12.0, ("right",))
+    result = run_plan(plan(*[gives(at_s, None) for at_s in (0.1, 1.0)], *jogs, duration_s=20.0))
+
+    assert [one.invariant for one in result.violations] == violated
 
 
 POWER_CUT = plan(

@@ -74,6 +74,8 @@ def test_plans_have_every_kind_of_happening():
         if isinstance(happening, Strike)
     }
     assert struck == of_lines | wrong | {("siderostat", "power cut")}
+    kinds = {happening.kind for happening in happenings}
+    assert {"D/A mute", "D/A mute at times", "D/A mute once", "stall of the supervisor"} <= kinds
 
 
 def test_plans_have_every_command_that_people_and_the_learner_give():
