@@ -23,6 +23,7 @@ from fitctl.logging.records import (
     DeviceFailure,
     DevicesOpened,
     Event,
+    MetrologyTick,
     ModeChange,
     PiezoReading,
     Tick,
@@ -36,6 +37,7 @@ from fitctl.messages.commands import (
     MoveCollector,
     Off,
     Recover,
+    Release,
     Reply,
     SequenceControl,
     SetBiasOffset,
@@ -56,6 +58,12 @@ POWER_S = 1.0  # a loop may have power without need, or need without power, no l
 _AT_REST = frozenset({Mode.OFF, Mode.SAFE})
 _FOLLOWING = frozenset(mode.name for mode in FOLLOWING)
 _CAUSE_S = 10.0  # before a fault, in which its cause must have been
+_LEADS_TO = {
+    Off: frozenset({Mode.OFF}),
+    Release: frozenset({Mode.OFF, Mode.SAFE, Mode.STANDBY}),
+    Stop: frozenset({Mode.OFF, Mode.SAFE}),
+}
+"""Modes of a loop once such a command has been accepted for it."""
 _FOR_ALL = {"Status", "RecentEvents"}
 _OF_THIS_MACHINE = {"RecorderReport", "LearnerReport"}
 _OF_COMMANDERS = {"Stop", "TakeOver", "SequenceControl", "SequenceReport"}
@@ -178,6 +186,7 @@ class Invariants:
         self.nothing_fails = False
         self._power_up_s: dict[str, float] = {}
         self._stop_answered_s: dict[str, float] = {}
+        self._ticks: Counter[str] = Counter()  # by loop: recorded in this step
         self._texts: Counter[str] = Counter()  # of errors, since devices were opened
         self._piezo_read_s: dict[str, float] = {}
         self._lease = "", -math.inf
@@ -224,6 +233,7 @@ class Invariants:
         self._stop_answered_s.clear()
         self._texts.clear()
         self._piezo_read_s = dict.fromkeys(self._rig.loops, math.inf)
+        self._ticks.clear()
         self._wrong_since_s.clear()
         self._pointed_at.clear()
         for lasting in self._lasting:
@@ -325,7 +335,16 @@ class Invariants:
         if isinstance(command, Stop | MoveCollector):  # a stop of whichever loop
             stops = isinstance(command, Stop) or command.action == "stop"
             self._collector_is_to_stop(is_so=stops)
+        # A command for all loops is carried out where it is possible; a stop is so everywhere.
+        for_each = command.loop or isinstance(command, Stop)
+        leads_to = (_LEADS_TO if for_each else {}).get(type(command), frozenset(Mode))
         for name in self._named(command):
+            mode = self._supervisor.loops[name].mode if self._supervisor else Mode.OFF
+            if mode not in leads_to:
+                self.violated(
+                    "a command that is accepted is carried out",
+                    f"{name}: in {mode.name} after {type(command).__name__}",
+                )
             if isinstance(command, Stop):
                 self._stop_answered_s[name] = now_s
             elif isinstance(command, SetBiasOffset):
@@ -351,9 +370,12 @@ class Invariants:
         """The supervisor makes a record."""
         match record:
             case Tick(number=number):  # the most frequent first
+                self._ticks[record.loop] += 1
                 if number >= 0:
                     self._acted_on(record)
                     self._follows(record)
+            case MetrologyTick():
+                self._ticks[record.loop] += 1
             case ModeChange():
                 self._without_mistake(record.reason)
                 self._mode_changed(record)
@@ -559,12 +581,18 @@ class Invariants:
             self._silent.leave_out(since_tick_s)
             self._sticking.leave_out(since_tick_s)
         for name, loop in supervisor.loops.items():
+            if self._ticks[name] != 1 and loop.mode is not Mode.OFF:
+                self.violated(
+                    "each step records one tick of each loop",
+                    f"{name}: {self._ticks[name]} in {loop.mode.name}",
+                )
             self._stuck(name, loop, now_s)
             self._power(name, loop.mode, busy=jobs.busy, now_s=now_s)
             self._safe_in_time(name, loop.mode, now_s)
             self._turns(name, loop.mode, now_s)
             self.motion.stands(name, loop, now_s)
             self._experiments(name, loop.mode, now_s)
+        self._ticks.clear()
         self._collector_rests(now_s)
         self._sequence_ends(supervisor, now_s)
 

@@ -26,6 +26,7 @@ from fitctl.messages.commands import (
     Experiment,
     Jog,
     MoveCollector,
+    Off,
     Release,
     Reply,
     SequenceControl,
@@ -100,6 +101,7 @@ class Rig:
         """Tick for a while; return what was violated until now."""
         for _ in range(round(seconds / TICK_S)):
             self.time.run_until(self.time.now_s() + TICK_S)
+            self.invariants._ticks.update(list(self.loops))  # each has recorded one
             self.invariants.tick()
         return [one.invariant for one in self.invariants.violations]
 
@@ -369,7 +371,7 @@ def test_the_hexapod_is_sent_nothing_beyond_its_limits(pose, velocity_mm_s, viol
 
 @pytest.mark.parametrize("stop", [Stop(loop="left"), MoveCollector(action="stop")])
 def test_a_platform_that_moves_on_after_a_stop_is_noticed(stop):
-    watched = Rig(TESTBED)
+    watched = Rig(TESTBED, mode=Mode.SAFE)
     watched.invariants.hexapod = SimpleNamespace(moves=True, line=watched.lines["hexapod"])
     assert watched.go_on(5.0) == []
     watched.invariants.answered(stop, Reply(accepted=True))
@@ -382,7 +384,7 @@ def test_a_platform_that_moves_on_after_a_stop_is_noticed(stop):
     "after", [MoveCollector(action="start"), MoveCollector(action="reference")]
 )
 def test_a_platform_that_is_started_again_may_move(after):
-    watched = Rig(TESTBED)
+    watched = Rig(TESTBED, mode=Mode.SAFE)
     watched.invariants.hexapod = SimpleNamespace(moves=True, line=watched.lines["hexapod"])
     watched.invariants.answered(Stop(), Reply(accepted=True))
     watched.invariants.answered(after, Reply(accepted=True))
@@ -592,6 +594,34 @@ def test_the_left_star_of_the_testbed_may_fail_with_its_link():
     reason = "siderostat metrology at can0: no answer"
     assert watched.invariants._has_cause("left", reason)
     assert not watched.invariants._has_cause("right", reason)
+
+
+@pytest.mark.parametrize("ticks", [0, 2])
+def test_a_step_that_does_not_record_one_tick_is_noticed(ticks):
+    watched = Rig("two-stars.toml")
+    watched.go_on(0.1)
+    watched.invariants._ticks.update({"right": 1, "left": ticks})
+    watched.invariants.tick()
+
+    (violation,) = watched.invariants.violations
+    assert violation.detail == f"left: {ticks} in VERNIER"
+
+
+@pytest.mark.parametrize(
+    ("command", "violated"),
+    [
+        (Stop(), ["a command that is accepted is carried out"]),
+        (Release(loop="right"), ["a command that is accepted is carried out"]),
+        (Release(), []),  # another loop may have been released
+        (Off(loop="right"), ["a command that is accepted is carried out"]),
+        (Standby(loop="right"), []),  # it begins to open devices
+    ],
+)
+def test_a_loop_is_where_a_command_has_sent_it(command, violated):
+    watched = Rig(mode=Mode.VERNIER)
+    watched.invariants.answered(command, Reply(accepted=True))
+
+    assert [one.invariant for one in watched.invariants.violations] == violated
 
 
 def test_only_what_was_admitted_may_be_passed_on_and_once():
