@@ -26,6 +26,7 @@ from fitctl.model.optics import gains_of, scales, stage_turn
 
 STACK_V = 2.5
 _SWINGS = 3
+_SURELY_EXCHANGED = 0.15  # better in `_unlike`; with even axes, another order is better by 0.45
 _SAME_SCALE = 0.1  # by which two stages' scales may differ and have one cause
 
 
@@ -136,9 +137,12 @@ def _mirror_outcome(site: Site, seen: Floats, expected: Floats, furthest_v: floa
                 "px; check the cable from the amplifier to the stack, and the stack"
             )
             raise StepError(msg, figures)
-    order = min(
+    order = likeliest = min(
         itertools.permutations(range(3)), key=lambda one: _unlike(seen, expected[list(one)])
     )
+    # The stacks exchanged in a circle look much like a mirror that is turned and has uneven axes.
+    if _unlike(seen, expected) - _unlike(seen, expected[list(likeliest)]) < _SURELY_EXCHANGED:
+        order = (0, 1, 2)
     matrix = _fit(seen, expected[list(order)])
     if _unlike(seen, expected[list(order)]) > 0.5:
         msg = (
@@ -158,11 +162,13 @@ def _mirror_outcome(site: Site, seen: Floats, expected: Floats, furthest_v: floa
         f"{now.rotation_deg:+.1f} degrees"
     ]
     found: dict[str, Any] = {}
-    if order != (0, 1, 2):
+    stacks_of_outputs = ", ".join(str(one + 1) for one in likeliest)
+    if order != likeliest:
         lines.append(
-            "the amplifier's outputs 1, 2, 3 are on stacks "
-            + ", ".join(str(one + 1) for one in order)
+            f"the amplifier's outputs 1, 2, 3 may also be on stacks {stacks_of_outputs}; check the cables"
         )
+    if order != (0, 1, 2):
+        lines.append(f"the amplifier's outputs 1, 2, 3 are on stacks {stacks_of_outputs}")
         for device in ("dac", "piezo"):
             old = getattr(fsm, device).channels or [1, 2, 3]
             found[device] = {"channels": [old[order.index(stack)] for stack in range(3)]}
