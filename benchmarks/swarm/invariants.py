@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from benchmarks.swarm.devices.amplifiers import SwarmAmplifiers
 from benchmarks.swarm.devices.hexapod import SwarmHexapod
 from benchmarks.swarm.lines import Line
-from benchmarks.swarm.motion import Motion
+from benchmarks.swarm.motion import AT_REST, STUCK_S, WELL_S, Motion
 from fitctl.clock import Clock
 from fitctl.config import Rig
 from fitctl.controllers.pair import LEARNT
@@ -55,13 +55,12 @@ Floats = NDArray[np.float64]
 NO_EXCEPTION = "no exception escapes"
 ANSWERED_ONCE = "a command is answered once"
 POWER_S = 1.0  # a loop may have power without need, or need without power, no longer than this
-_AT_REST = frozenset({Mode.OFF, Mode.SAFE})
 _FOLLOWING = frozenset(mode.name for mode in FOLLOWING)
 _CAUSE_S = 10.0  # before a fault, in which its cause must have been
 _LEADS_TO = {
     Off: frozenset({Mode.OFF}),
     Release: frozenset({Mode.OFF, Mode.SAFE, Mode.STANDBY}),
-    Stop: frozenset({Mode.OFF, Mode.SAFE}),
+    Stop: AT_REST,
 }
 """Modes of a loop once such a command has been accepted for it."""
 _FOR_ALL = {"Status", "RecentEvents"}
@@ -69,7 +68,6 @@ _OF_THIS_MACHINE = {"RecorderReport", "LearnerReport"}
 _OF_COMMANDERS = {"Stop", "TakeOver", "SequenceControl", "SequenceReport"}
 _MOST_STEP_S = 1.0  # and as much for each loop with a D/A, which is read after a pause
 _MOST_PERIODS = 2.0  # a frame on which a tick acts is no older than that and its delay
-_WELL_S = 2.0
 _LEFT_S = 2.0  # a supervisor leaves where its stars are once a second
 _JUMP_RAD = 1.0  # what motors may coast unseen, and somewhat more
 _MOST_BUSY_S = 60.0
@@ -81,7 +79,6 @@ _ANOTHERS_PX = 6.0  # from its own star, no window of a loop shows its own
 _MOST_WRONG_S = 10.0
 # As `made_safe` in the fault catalogue, tests/faults/devices.py.
 _SAFE_S, _SAFE_BY_PIEZO_S = 3.0, 8.0
-_STUCK_S = 1.0  # for so long after motors were stuck, a servo may still be behind its reference
 _RESTS_S = 1.0  # beyond the time after which a drive without its master stops by itself
 _SURELY = 1.2  # times the following error limit: a servo that is behind so far must notice
 _COLLECTOR_RESTS_S = 3.0
@@ -421,9 +418,8 @@ class Invariants:
         lost_rad = self._zeros_read_rad.pop(name, None)
         if lost_rad is not None:
             self._zeros_noticed_s[name] = self._clock.now_s()
-        if (
-            name in self._misread
-        ):  # this opening's reading, or the last before it, may have been wrong
+        # This opening's reading, or the last before it, may have been wrong.
+        if name in self._misread:
             if not self._lines[f"{name} siderostat"].was_wrong("encoder", _MOST_WRONG_S):
                 self._misread.discard(name)
             return
@@ -480,7 +476,7 @@ class Invariants:
         return (
             not line.is_bad
             and "drops" not in line.wrong
-            and self._clock.now_s() - line.healed_s > _WELL_S
+            and self._clock.now_s() - line.healed_s > WELL_S
         )
 
     def _mode_changed(self, change: ModeChange) -> None:
@@ -514,24 +510,19 @@ class Invariants:
         if reason.startswith("interlock") or now_s - self.motion.stall_ended_s < _CAUSE_S:
             return True
         link = self._rig.stellar_loops[name].link if name in self._stellar_loops else None
-        named = {
-            device
+        return any(
+            line.is_bad
+            or line.wrong
+            or now_s - max(line.healed_s, self._struck_s.get(device, -math.inf)) < _CAUSE_S
             for device, line in self._lines.items()
             if device.partition(" ")[0] in {name, link, "camera", "hexapod"}
             and reason.startswith(line.device)
-        }
-        return any(
-            self._lines[device].is_bad
-            or self._lines[device].wrong
-            or now_s - max(self._lines[device].healed_s, self._struck_s.get(device, -math.inf))
-            < _CAUSE_S
-            for device in named
         )
 
     def _was_stuck(self, name: str) -> bool:
         """Its motors do not move or an encoder is wrong, or that was so recently, or before a recent stall."""
-        stalled = self._clock.now_s() - self.motion.stall_ended_s < _STUCK_S
-        within_s = _MOST_WRONG_S if stalled else _STUCK_S
+        stalled = self._clock.now_s() - self.motion.stall_ended_s < STUCK_S
+        within_s = _MOST_WRONG_S if stalled else STUCK_S
         line = self._lines[f"{name} siderostat"]
         return any(line.was_wrong(fault, within_s) for fault in ("stuck", "encoder"))
 
@@ -552,7 +543,7 @@ class Invariants:
         """A supervisor has ended in good order: no amplifiers keep power that it had reached until then."""
         for name, amplifiers in self._amplifiers.items():
             line = amplifiers.line
-            was_well = not line.is_bad and self._clock.now_s() - line.healed_s > _WELL_S
+            was_well = not line.is_bad and self._clock.now_s() - line.healed_s > WELL_S
             if amplifiers.powered and name in reached and was_well:
                 self.violated("an orderly end disables the amplifiers", name)
 
@@ -599,8 +590,11 @@ class Invariants:
     def _sequence_ends(self, supervisor: Supervisor, now_s: float) -> None:
         """A sequence that somebody orders to end does so."""
         status = supervisor.sequences.status() if self._ended_run else None
-        goes_on = status is not None and status.run == self._ended_run
-        goes_on = goes_on and status.state in {"running", "paused"}  # type: ignore[union-attr]
+        goes_on = (
+            status is not None
+            and status.run == self._ended_run
+            and status.state in {"running", "paused"}
+        )
         lasted_s = self._ending.lasted_s("", is_so=goes_on, now_s=now_s)
         if lasted_s > _SEQUENCE_ENDS_S:
             self.violated("a sequence that is ordered to end does so", f"not in {lasted_s:.1f} s")
@@ -618,7 +612,7 @@ class Invariants:
             for state, (is_so, from_s) in states.items():
                 lasted_s = self._silent.lasted_s(
                     f"{name}: {device} {state}",
-                    is_so=mode not in _AT_REST and bool(is_so),
+                    is_so=mode not in AT_REST and bool(is_so),
                     now_s=now_s,
                     from_s=from_s,
                 )
@@ -645,7 +639,7 @@ class Invariants:
         stuck_s = self._sticking.lasted_s(
             name,
             is_so="stuck" in line.wrong
-            and loop.mode not in _AT_REST
+            and loop.mode not in AT_REST
             and line.is_readable
             and away_rad > _SURELY * siderostat.servo.following_error_limit_rad,
             now_s=now_s,
@@ -675,7 +669,7 @@ class Invariants:
         """Motors stand still in OFF and SAFE; a drive without a watchdog cannot be stopped over a bad line."""
         amplifiers = self._amplifiers[name]
         line = amplifiers.line
-        turns = mode in _AT_REST and amplifiers.velocity_rad_s != (0.0, 0.0)
+        turns = mode in AT_REST and amplifiers.velocity_rad_s != (0.0, 0.0)
         if turns and amplifiers.watches_nobody:
             turns = name in self._opened and line.connected and not line.is_bad
         turned_s = self._turning.lasted_s(name, is_so=turns, now_s=now_s)
@@ -716,7 +710,7 @@ class Invariants:
             self._unneeded.lasted_s(name, is_so=False, now_s=now_s)
             return
         reachable = amplifiers.line.connected and not amplifiers.line.is_bad
-        rests = mode in _AT_REST
+        rests = mode in AT_REST
         powerless_s = self._powerless.lasted_s(
             name, is_so=not (rests or busy or amplifiers.powered), now_s=now_s
         )

@@ -1,4 +1,4 @@
-"""What is sent to stages, and how they move: within their limits, and not where nobody moves them."""
+"""Checks of what fitctl sends to the stages, and of how they move."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ Floats = NDArray[np.float64]
 _HARDLY = 0.02  # of the velocity limit: slower, a servo corrects what its encoder counts
 _MOVED_S = 1.0  # beyond the time that a siderostat takes from one end of its travel to the other
 _MIRROR_RESTS_S = 1.0  # beyond the time that a mirror takes through its whole range
-_WELL_S = 2.0
+WELL_S = 2.0  # after a fault, a line is taken to be well
 _DECIDED_S = 0.001  # no later than this after its decision a write is sent, on a line that is well
 _MOST_COUNTS = 5.0  # of the encoder: a siderostat that stands still moves no farther
 _SLOWLY = frozenset({Mode.OFF, Mode.SAFE, Mode.STANDBY})
 _STILL: AzEl = (0.0, 0.0)
 _SLACK = 1.0 + 1e-6
-_STUCK_S = 1.0  # for so long after motors were stuck, a servo may still be behind its reference
-_AT_REST = frozenset({Mode.OFF, Mode.SAFE})
+STUCK_S = 1.0  # for so long after motors were stuck, a servo may still be behind its reference
+AT_REST = frozenset({Mode.OFF, Mode.SAFE})
 
 
 class Motion:
@@ -146,7 +146,7 @@ class Motion:
                 "a stop is obeyed at once",
                 f"{name}: {velocity_rad_s} rad/s {since_stop_s:.3f} s after it",
             )
-        if loop.mode in _AT_REST:
+        if loop.mode in AT_REST:
             at_rest_s = self._clock.now_s() - loop.mode_since_s
             if at_rest_s > three_periods_s:
                 self._violated(
@@ -156,7 +156,7 @@ class Motion:
 
     def _within_travel(self, name: str, velocity_rad_s: AzEl) -> None:
         """No motor that is beyond the travel, by the drive's count, is driven farther out."""
-        if self._lines[f"{name} siderostat"].was_wrong("encoder", _STUCK_S):
+        if self._lines[f"{name} siderostat"].was_wrong("encoder", STUCK_S):
             return
         most_rad = self._travel_rad[name] + self._coasts_rad[name]
         hardly_rad_s = _HARDLY * self._most_rad_s[name]
@@ -244,7 +244,7 @@ class Motion:
         """No D/A has made a loop wait with its writes recently."""
         for name in self._stellar_loops:
             line = self._lines[f"{name} D/A"]
-            if line.is_bad or line.wrong or self._clock.now_s() - line.healed_s < _WELL_S:
+            if line.is_bad or line.wrong or self._clock.now_s() - line.healed_s < WELL_S:
                 return False
         return True
 

@@ -429,8 +429,7 @@ def _interrupted_slew(random: Random, at_s: float, loops: tuple[str, ...]) -> li
 def _killed_search(random: Random, at_s: float) -> list[Happening]:
     """Clouds hide the stars for long, and in the search for them the supervisor is killed, up to four times."""
     who, lasts_s = OPERATORS[0], random.uniform(*_HIDDEN_S)
-    cloud = Cloud(at_s=at_s, lasts_s=lasts_s, part=0.0)
-    happenings: list[Happening] = [cloud]
+    happenings: list[Happening] = [Cloud(at_s=at_s, lasts_s=lasts_s, part=0.0)]
     for _ in range(random.randint(1, 4)):
         killed_s = at_s + lasts_s * random.uniform(0.3, 1.0)
         happenings.append(Kill(at_s=killed_s, back_after_s=0.1))

@@ -10,8 +10,10 @@ from __future__ import annotations
 import math
 import re
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import SimpleNamespace
+from unittest.mock import patch
 
 import msgspec
 
@@ -104,6 +106,18 @@ ZMQ = SimpleNamespace(
 """Stands for the parts of the module ``zmq`` that the queue uses."""
 
 
+@contextmanager
+def installed(time: VirtualTime) -> Iterator[None]:
+    """Record queues have a `Wire`, and wait on virtual time, meanwhile."""
+    clock = SimpleNamespace(monotonic=time.now_s)
+    with (
+        patch("fitctl.logging.queue.zmq", ZMQ),
+        patch("fitctl.logging.queue.time", clock),
+        patch("fitctl.daemon.last_records.time", clock),
+    ):
+        yield
+
+
 class SwarmRecorder:
     """The recorder of one supervisor, restarted as long as the supervisor lives.
 
@@ -133,8 +147,8 @@ class SwarmRecorder:
         self._wire: Wire = queue._socket  # type: ignore[assignment]
         self._unflushed: list[int] = []
         self._starts = 0
-        self._stays_dead = False  # nobody starts it again
-        self._ends_s = math.inf  # it was asked to end, and takes nothing after this time
+        self._stays_dead = False
+        self._ends_s = math.inf  # asked to end, it takes nothing after this time
         self.stuck_until_s = 0.0
         self._wire.sleep = time.sleep
         self._start()
@@ -149,7 +163,7 @@ class SwarmRecorder:
         self._ends_s = self._time.now_s() + _DRAIN_S
 
     def end(self, timeout_s: float = 0.0) -> None:
-        """It is gone for good, with what it has not written."""
+        """Kill it for good; what it has not written is lost."""
         self._stays_dead = True
         self.die()
 

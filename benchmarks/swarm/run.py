@@ -11,9 +11,7 @@ from functools import partial
 from pathlib import Path
 from random import Random
 from time import process_time
-from types import SimpleNamespace
 from typing import Any
-from unittest.mock import patch
 
 import msgspec
 import numpy as np
@@ -42,7 +40,8 @@ from benchmarks.swarm.plan import (
     Stall,
     Strike,
 )
-from benchmarks.swarm.recorder import ZMQ, SwarmRecorder
+from benchmarks.swarm.recorder import SwarmRecorder
+from benchmarks.swarm.recorder import installed as recorder_installed
 from benchmarks.swarm.service import SENDERS, SwarmService
 from benchmarks.swarm.service import installed as service_installed
 from benchmarks.swarm.telemetry_wire import (
@@ -95,9 +94,7 @@ _SEQUENCE_ENDS_S = 15.0
 _MOST_DESIGN_S = 20.0
 _NOISE_STEP = 1.05
 _SAVED_S = 1.0  # so often a supervisor leaves where its stars are
-_MISLED_S = (
-    10.0  # for so long after a repeated image, or a wrong encoder, a star's place may be wrong
-)
+_MISLED_S = 10.0  # after a repeated image or a wrong encoder, in which a star's place may be wrong
 _BACK_S = 15.0  # after a kill or a shutdown, and what was waited for when all was healed
 _STAY_S = 5.0  # for so long a star that is held must stay so
 _STAYS_PX = 0.5  # mean over a second
@@ -620,9 +617,7 @@ def _run(plan: Plan, on_record: Callable[[AnyRecord], None], began_s: float) -> 
     subscribers = drawn_subscribers(time, random, plan.remote_consoles)
     with (
         installed(time),
-        patch("fitctl.logging.queue.zmq", ZMQ),
-        patch("fitctl.logging.queue.time", SimpleNamespace(monotonic=time.now_s)),
-        patch("fitctl.daemon.last_records.time", SimpleNamespace(monotonic=time.now_s)),
+        recorder_installed(time),
         client_installed(time, subscribers),
         computer_installed(time, computer),
         service_installed(time, Random(f"{plan.seed} service")),  # noqa: S311

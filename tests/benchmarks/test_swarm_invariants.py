@@ -552,6 +552,19 @@ def test_a_mirror_that_points_stays_within_its_diamond(part, violated, direction
     assert watched.go_on(0.1) == violated
 
 
+def fault(reason):
+    """The right loop goes to SAFE."""
+    return ModeChange(
+        time_s=0.0,
+        loop="right",
+        source="VERNIER",
+        target="SAFE",
+        target_number=0,
+        trigger="FAULT",
+        reason=reason,
+    )
+
+
 NO_CAUSE = ["without a fault nothing fails"]
 
 
@@ -571,16 +584,7 @@ def test_what_fails_has_its_cause_in_its_own_devices(rig, struck, reason, violat
     watched.invariants.violations.clear()
     watched.invariants.struck(struck)
     watched.go_on(1.0)
-    change = ModeChange(
-        time_s=watched.time.now_s(),
-        loop="right",
-        source="VERNIER",
-        target="SAFE",
-        target_number=5,
-        trigger="FAULT",
-        reason=reason,
-    )
-    watched.invariants.record(change)
+    watched.invariants.record(fault(reason))
 
     found = [one.invariant for one in watched.invariants.violations]
     assert [one for one in found if one.startswith("without")] == violated
@@ -674,17 +678,7 @@ def test_amplifiers_that_keep_power_after_an_orderly_end_are_noticed():
 
 def test_a_mistake_in_fitctl_that_looks_like_a_fault_is_a_violation():
     watched = Rig()
-    reason = error_text(KeyError("reading"))
-    change = ModeChange(
-        time_s=0.0,
-        loop="right",
-        source="VERNIER",
-        target="SAFE",
-        target_number=0,
-        trigger="FAULT",
-        reason=reason,
-    )
-    watched.invariants.record(change)
+    watched.invariants.record(fault(error_text(KeyError("reading"))))
 
     assert watched.go_on(0.1) == [NO_EXCEPTION]
 

@@ -2,7 +2,6 @@
 
 from functools import partial
 from random import Random
-from types import SimpleNamespace
 from typing import get_args
 
 import msgspec
@@ -28,14 +27,14 @@ from benchmarks.swarm.plan import (
     Stall,
     Strike,
 )
-from benchmarks.swarm.recorder import ZMQ, SwarmRecorder
+from benchmarks.swarm.recorder import SwarmRecorder, installed
 from benchmarks.swarm.rigs import RIGS, SLOW, learning, slow_servos
 from benchmarks.swarm.run import RIGS as FOLDER
 from benchmarks.swarm.run import run_plan
 from benchmarks.swarm.service import SENDERS, SwarmService
 from benchmarks.swarm.telemetry_wire import RemoteConsole
 from fitctl.config import load_rig
-from fitctl.daemon import last_records
+from fitctl.daemon.last_records import finish_log
 from fitctl.logging.queue import RecordQueue
 from fitctl.logging.records import ControllerChange, Event, RecorderStatus
 from fitctl.messages import client
@@ -87,12 +86,9 @@ def gives(at_s, command, who="ada"):
 
 
 @pytest.fixture
-def queue(monkeypatch, time):
-    monkeypatch.setattr("fitctl.logging.queue.zmq", ZMQ)
-    clock = SimpleNamespace(monotonic=time.now_s)
-    monkeypatch.setattr("fitctl.logging.queue.time", clock)
-    monkeypatch.setattr("fitctl.daemon.last_records.time", clock)
-    return RecordQueue("swarm", 50)
+def queue(time):
+    with installed(time):
+        yield RecordQueue("swarm", 50)
 
 
 def offer(queue, time, count):
@@ -191,8 +187,10 @@ def test_what_is_not_written_at_the_end_must_be_reported(
     monkeypatch, time, queue, trouble, reports
 ):
     if not reports:
-        silent = partial(_finish_log_silently, last_records.finish_log)
-        monkeypatch.setattr("benchmarks.swarm.recorder.finish_log", silent)
+        monkeypatch.setattr(
+            "benchmarks.swarm.recorder.finish_log",
+            lambda queue, recorder, _report: finish_log(queue, recorder, lambda _line: None),
+        )
     recorder = SwarmRecorder(time, queue)
     time.run_until(1.0)
     recorder.stuck_until_s = 100.0 if trouble == "stuck" else 0.0
@@ -207,10 +205,6 @@ def test_what_is_not_written_at_the_end_must_be_reported(
     expected = "" if reports else "at the end 40 are not written; reported: nothing"
     # Records that a dead recorder was never sent count as lost.
     assert unreported == ("" if trouble == "dead" else expected)
-
-
-def _finish_log_silently(finish_log, queue, recorder, _report):
-    finish_log(queue, recorder, lambda _line: None)
 
 
 # ------------------------------------------------------------ lease and rights

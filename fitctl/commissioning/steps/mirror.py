@@ -137,14 +137,13 @@ def _mirror_outcome(site: Site, seen: Floats, expected: Floats, furthest_v: floa
                 "px; check the cable from the amplifier to the stack, and the stack"
             )
             raise StepError(msg, figures)
-    order = likeliest = min(
-        itertools.permutations(range(3)), key=lambda one: _unlike(seen, expected[list(one)])
-    )
-    # The stacks exchanged in a circle look much like a mirror that is turned and has uneven axes.
-    if _unlike(seen, expected) - _unlike(seen, expected[list(likeliest)]) < _SURELY_EXCHANGED:
-        order = (0, 1, 2)
+    own = (0, 1, 2)
+    unlike = {one: _unlike(seen, expected[list(one)]) for one in itertools.permutations(range(3))}
+    likeliest = min(unlike, key=lambda one: unlike[one])
+    # Stacks exchanged in a circle look much like a mirror that is turned and has uneven axes.
+    order = own if unlike[own] - unlike[likeliest] < _SURELY_EXCHANGED else likeliest
     matrix = _fit(seen, expected[list(order)])
-    if _unlike(seen, expected[list(order)]) > 0.5:
+    if unlike[order] > 0.5:
         msg = (
             "the stacks do not move the star as three corners of a square would; check "
             "that all three carry the "
@@ -167,7 +166,7 @@ def _mirror_outcome(site: Site, seen: Floats, expected: Floats, furthest_v: floa
         lines.append(
             f"the amplifier's outputs 1, 2, 3 may also be on stacks {stacks_of_outputs}; check the cables"
         )
-    if order != (0, 1, 2):
+    if order != own:
         lines.append(f"the amplifier's outputs 1, 2, 3 are on stacks {stacks_of_outputs}")
         for device in ("dac", "piezo"):
             old = getattr(fsm, device).channels or [1, 2, 3]
