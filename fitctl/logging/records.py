@@ -229,13 +229,18 @@ class OutputsFound(Record, frozen=True, kw_only=True):
 
 
 class StarPlace(Record, frozen=True, kw_only=True):
-    """Position of the star that a killed supervisor held: on the camera, with the loop's own stages at zero."""
+    """Position of the star that a killed supervisor held: on the camera, with the loop's own stages at zero.
+
+    The motors are where they were then; without a link, those of its siderostat are at 0.
+    """
 
     loop: str
     az_px: float
     el_px: float
     siderostat_az_rad: float
     siderostat_el_rad: float
+    link_az_rad: float
+    link_el_rad: float
 
 
 class DeviceFailure(Record, frozen=True, kw_only=True):

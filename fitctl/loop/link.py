@@ -14,7 +14,7 @@ from fitctl.controllers.feedforward import link_matrix
 from fitctl.loop.metrology import MetrologyLoop
 from fitctl.messages.modes import Mode
 from fitctl.model.hysteresis import play
-from fitctl.model.optics import Scales, motor_sky_rad_per_rad
+from fitctl.model.optics import AzEl, Scales, motor_sky_rad_per_rad
 from fitctl.stages.servo import ServoState
 from fitctl.stages.siderostat import SiderostatStage
 
@@ -84,6 +84,11 @@ class Link:
         """It has held for so long that the own siderostat has undone what happened meanwhile."""
         return self.holds and now_s - self.loop.mode_since_s >= self._settle_s
 
+    @property
+    def zero_is_lost(self) -> bool:
+        """The encoders count from elsewhere than when :meth:`zero_was_lost` was last asked."""
+        return self._zeros_lost != self.loop.zeros_lost or self.loop.servo.encoders_jumped
+
     def zero_was_lost(self) -> bool:
         """The encoders count from elsewhere than when last asked: what was turned before is unknown."""
         before, self._zeros_lost = self._zeros_lost, self.loop.zeros_lost
@@ -100,11 +105,15 @@ class Link:
     @property
     def turned_rad(self) -> Floats:
         """From the origin, by the encoders as last read."""
-        return self._matrix @ self.motor_rad - self.origin_rad
+        return self.turned_with(self.motor_rad)
 
     def turned_at(self, time_s: float) -> Floats:
         """From the origin, by the encoders at a recent time."""
-        return self._matrix @ self.servo.position_at(time_s) - self.origin_rad
+        return self.turned_with(self.servo.position_at(time_s))
+
+    def turned_with(self, motor_rad: Floats) -> Floats:
+        """From the origin, with the motors of the link's siderostat at `motor_rad`, shape (2,)."""
+        return self._matrix @ motor_rad - self.origin_rad
 
     @property
     def matrix(self) -> Floats:
@@ -119,6 +128,11 @@ class Link:
         """Count turns from here on."""
         self.begin()
         self.origin_rad = self.undone_rad
+
+    def recall(self, motor_rad: AzEl) -> None:
+        """Count turns from where a supervisor that was killed had the motors of the link's siderostat."""
+        self.loop.servo.recall(motor_rad)
+        self.origin_rad = self._matrix @ np.array(motor_rad)
 
     @property
     def undone_from_origin_rad(self) -> Floats:

@@ -153,6 +153,10 @@ class Loop(ABC):
         self.quantities.begin()
         self.interlocks.reset_all(self._clock.now_s())
 
+    def jog(self, step_sky_arcsec: Floats) -> None:
+        """Turn the siderostat by hand, by an angle on the sky, shape (2,)."""
+        self.siderostat.jog(step_sky_arcsec)
+
     def release(self) -> None:  # noqa: B027 - the siderostat's servo has no need of it
         """Send nothing more to devices, which are opened anew or closed, until :meth:`begin`."""
 

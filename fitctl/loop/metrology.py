@@ -29,8 +29,7 @@ from fitctl.drivers.interface import (
 from fitctl.logging.records import MetrologyTick
 from fitctl.loop.loop import Loop
 from fitctl.loop.quantities import MetrologyQuantities, metrology_places
-from fitctl.loop.search.beam import beam_search
-from fitctl.loop.search.spiral import SpiralSearch
+from fitctl.loop.search.beam import BeamSearch
 from fitctl.messages.commands import Acquire
 from fitctl.messages.modes import (
     BEAM_FOLLOWING,
@@ -86,7 +85,7 @@ class MetrologyLoop(Loop):
 
     Attributes
     ----------
-    search : SpiralSearch
+    search : BeamSearch
     hold : BeamHold
     lost, in_reach, out_of_reach : int
         Samples in a row, by :func:`fitctl.controllers.frame_counts.count_sample`.
@@ -115,7 +114,7 @@ class MetrologyLoop(Loop):
         self.settings: MetrologySettings = rig.metrology_loops[name]
         settings = self.settings
         self.quantities: MetrologyQuantities
-        self.search: SpiralSearch = beam_search(rig, name)
+        self.search = BeamSearch(rig, name)
         self.hold = BeamHold(settings.hold.crossover_hz, settings.hold.second_integrator_hz)
         self._array = PhotodiodeArray(settings.sensor, settings.acquisition.detection_sigma)
         self._photodiodes = photodiodes
@@ -218,7 +217,7 @@ class MetrologyLoop(Loop):
     def _find_trigger(self, sample: DiodeReading, beam: Beam, motor_rad: Floats) -> Finding | None:
         if self.mode is Mode.ACQUISITION:
             has_light = beam.state is not BeamState.LOST
-            return self.search.look(has_light, motor_rad, sample.time_s)
+            return self.search.evaluate(has_light, motor_rad, sample.time_s)
         return self._follow(beam) if self.mode in BEAM_FOLLOWING else None
 
     def _follow(self, beam: Beam) -> Finding | None:
@@ -246,7 +245,8 @@ class MetrologyLoop(Loop):
         self.lost = self.in_reach = self.out_of_reach = 0
         super()._enter(source, motor_rad)
         if self.mode is Mode.ACQUISITION:
-            self._start_search(motor_rad, again=source in BEAM_FOLLOWING)
+            asked, self._asked = self._asked, Acquire()
+            self.search.start_as_asked(asked, motor_rad, again=source in BEAM_FOLLOWING)
         elif self.mode is Mode.LOCKED:
             self.hold.begin()
 
@@ -254,19 +254,11 @@ class MetrologyLoop(Loop):
         """How the next search, and no other, is to be made, as a command asks that was not refused."""
         self._asked = asked
 
-    def _start_search(self, motor_rad: Floats, *, again: bool) -> None:
-        """As asked; else about where the siderostat is, which for a beam that was lost is its last place."""
-        asked, self._asked = self._asked, Acquire()
-        centre_rad = motor_rad
-        if asked.expected_az_sky_arcsec is not None and asked.expected_el_sky_arcsec is not None:
-            expected = np.array([asked.expected_az_sky_arcsec, asked.expected_el_sky_arcsec])
-            centre_rad = expected / ARCSEC_PER_RAD / self._motor_sky
-        self.search.start(centre_rad, again=again, radius_sky_arcsec=asked.search_radius_sky_arcsec)
-
     # ------------------------------------------------------------ control laws
 
-    def _search(self, _sensed: _Sensed, duration_s: float) -> None:
-        self.siderostat.move_to(self.search.advance(duration_s))
+    def _search(self, sensed: _Sensed, duration_s: float) -> None:
+        position_rad = sensed.servo.position_rad
+        self.siderostat.move_to(self.search.advance_from(position_rad, position_rad, duration_s))
 
     def _pull_in(self, sensed: _Sensed, duration_s: float) -> None:
         error_rad = self._error_rad(sensed.beam)
@@ -294,10 +286,17 @@ class MetrologyLoop(Loop):
         """Begin anew: from now on the photodiodes are sampled."""
         super().begin(stack_v)
         self._photodiode_error = None
-        self.zeros_lost += self.servo.encoders_jumped
-        self.servo.encoders_jumped = False
+        if self.servo.encoders_jumped:
+            self.servo.encoders_jumped = False
+            self.zeros_lost += 1
+            self.search.forget()
         self._sampled_s, self._ticked_s = self._clock.now_s(), math.nan
         self._ready = True
+
+    def jog(self, step_sky_arcsec: Floats) -> None:
+        """Turn the siderostat by hand; the next search begins there."""
+        super().jog(step_sky_arcsec)
+        self.search.forget()
 
     def release(self) -> None:
         """Ask for no more samples."""

@@ -108,8 +108,7 @@ class StellarLoop(Loop):
             False  # what the link's siderostat turns moves the star that is expected
         )
         self._rig_noise_px = sensor_noise_px(rig.camera, self.settings, self.settings.star_flux_dn)
-        self._recalled: StarPlace | None = None
-        self._is_recalled = False  # what the star finder expects, and no search has begun there yet
+        self._recalled: StarPlace | None = None  # until the devices are open
         self._held_undone_rad = np.zeros(2)  # of link and sky, as an experiment began
         self._laws: dict[Mode, Callable[[Observation], None]] = {
             Mode.OFF: self._rest,
@@ -148,7 +147,7 @@ class StellarLoop(Loop):
             link_rad = sky_rad if link_rad is None else link_rad + sky_rad
         if frame is not None:
             beam_rad = motor_rad if link_rad is None else motor_rad + link_rad
-            star = self._find(frame, mirror_rad, beam_rad)
+            star = self._find(frame, mirror_rad, motor_rad, beam_rad)
         self.observation = Observation(
             frame,
             frames_lost,
@@ -279,13 +278,17 @@ class StellarLoop(Loop):
             self.learning.fell_back(why_back, observation.now_s)
             self.use(self.learning.before, why_back, by_itself=True)
 
-    def _find(self, frame: Frame, mirror_rad: Floats, beam_rad: Floats) -> Star | None:
+    def _find(
+        self, frame: Frame, mirror_rad: Floats, motor_rad: Floats, beam_rad: Floats
+    ) -> Star | None:
         self.star_finder.exclude(
             (other.spots for other in self.others),
             (other.candidate_spots(frame.mid_exposure_s) for other in self.others),
         )
         if self.mode is Mode.ACQUISITION and (
-            self._search_due is not None or self.waits_for or not self.search.has_arrived(beam_rad)
+            self._search_due is not None
+            or self.waits_for
+            or not self.search.has_arrived(motor_rad, beam_rad)
         ):
             return None  # what is seen on the way is another star
         follows = self.mode in FOLLOWING and self.following.lost == 0
@@ -437,9 +440,8 @@ class StellarLoop(Loop):
             # What the link's siderostat turned before, to find its beam, moved no star that was known. A
             # command that gives a place means it with the link as it is now.
             self.link.set_origin()
-            if not self._is_recalled:
-                self.star_finder.estimator.forget()
-        self._link_counts, self._is_recalled = True, False
+            self.star_finder.estimator.forget()
+        self._link_counts = True
         self.star_finder.estimator.expect(self.target_px, self._beam_rad(motor_rad), np.zeros(2))
         self.search.start_where_expected(again=again)
 
@@ -490,10 +492,7 @@ class StellarLoop(Loop):
 
     def _evaluate_waiting(self, observation: Observation) -> None:
         """Wait where the stages are, or go on, and report which."""
-        if self.link is not None and self.link.zero_was_lost():
-            self._link_counts = False
-            self.link.set_origin()
-            self.star_finder.estimator.forget()
+        self._forget_with_link_zero()
         before, waits_for = self.waits_for, self._why_wait(observation.now_s, observation.motor_rad)
         self.waits_for = waits_for
         if waits_for and not before:
@@ -507,6 +506,19 @@ class StellarLoop(Loop):
             self._go_on(observation)
         if self.mode is Mode.ACQUISITION and self._search_due is not None:
             self._start_search(observation.motor_rad)
+
+    def _forget_with_link_zero(self) -> None:
+        """The star is expected with the link as it was; if that counts from elsewhere now, nowhere."""
+        if self.link is not None and self.link.zero_was_lost():
+            if self.star_finder.estimator.origin_px is not None:
+                link = self.link.loop.name
+                self._report_event(
+                    "warning",
+                    f"encoders of {link} read elsewhere than before; the star's place is forgotten",
+                )
+            self._link_counts = False
+            self.link.set_origin()
+            self.star_finder.estimator.forget()
 
     def _go_on(self, observation: Observation) -> None:
         """The control laws begin anew from where the stages are."""
@@ -542,7 +554,9 @@ class StellarLoop(Loop):
 
     def _search(self, observation: Observation) -> None:
         self.mirror.step_to_rest()
-        wanted_rad = self.search.advance_from(observation.beam_rad, self._period_s)
+        wanted_rad = self.search.advance_from(
+            observation.motor_rad, observation.beam_rad, self._period_s
+        )
         if self.link is not None:
             wanted_rad = wanted_rad - self.link.undone_from_origin_rad
         if self.sky is not None:
@@ -666,6 +680,8 @@ class StellarLoop(Loop):
         """The newest of everything, for consoles."""
         scale, mode, design = self._scale, self.mode, self.pointing.design
         centre_rad = self.search.centre_rad - self.search.sky_rad
+        if self.link is not None:
+            centre_rad = centre_rad - self.link.undone_from_origin_rad
         centre_sky_arcsec = (centre_rad * scale.motor_sky_arcsec_per_rad).tolist()
         az_urad, el_urad = (1e6 * self.mirror.bias_offset_rad).tolist()
         return LoopState(
@@ -721,22 +737,29 @@ class StellarLoop(Loop):
                 f"the siderostat turned on by {turned_arcsec:.0f} arcsec on the sky while its amplifiers did "
                 "not answer; the star's place is kept, and acquire goes back there",
             )
-        if recalled is not None and not jumped:
-            self._go_back_to(recalled)
+        self._forget_with_link_zero()
+        if recalled is not None and self.star_finder.estimator.origin_px is not None:
+            self._journal.record(msgspec.structs.replace(recalled, time_s=self._clock.now_s()))
+            self._report_event(
+                "info",
+                "the star's place is known from before the supervisor was killed; acquire goes back there",
+            )
 
     @property
     def star_place(self) -> StarPlace | None:
         """Where its star is, for a supervisor after this one; None where nothing is known of it."""
         estimator = self.star_finder.estimator
-        if self._recalled is not None or estimator.origin_px is None:
-            return self._recalled  # what has not come to use yet is not forgotten
-        if self.servo.encoders_jumped:  # since the star was seen: the place has another zero
+        # Encoders that have jumped since the star was found have another zero than its place.
+        jumped = self.servo.encoders_jumped or (self.link is not None and self.link.zero_is_lost)
+        if estimator.origin_px is None or jumped:
             return None
         az_rad, el_rad = self.servo.position_rad.tolist()
-        # A recalled place is with the link as it was then: what it turns counts from the first search on.
-        link = None if self._is_recalled else self.link
-        link_rad = np.zeros(2) if link is None else link.turned_rad
+        link_motor_rad = link_rad = np.zeros(2)
+        if self.link is not None:
+            link_motor_rad = self.link.loop.servo.position_rad
+            link_rad = self.link.turned_with(link_motor_rad)
         link_az_px, link_el_px = estimator.stages_px(link_rad, np.zeros(2))
+        link_az_rad, link_el_rad = link_motor_rad.tolist()
         return StarPlace(
             time_s=self._clock.now_s(),
             loop=self.name,
@@ -744,22 +767,18 @@ class StellarLoop(Loop):
             el_px=estimator.origin_px[1] + link_el_px,
             siderostat_az_rad=az_rad,
             siderostat_el_rad=el_rad,
+            link_az_rad=link_az_rad,
+            link_el_rad=link_el_rad,
         )
 
     def recall(self, place: StarPlace) -> None:
-        """Once its devices are open, expect the star where a supervisor that was killed had it."""
+        """Expect the star where a supervisor that was killed had it."""
         self._recalled = place
         self.servo.recall((place.siderostat_az_rad, place.siderostat_el_rad))
-
-    def _go_back_to(self, place: StarPlace) -> None:
-        # The first search counts from here what the link's siderostat turns.
+        if self.link is not None:
+            self.link.recall((place.link_az_rad, place.link_el_rad))
         self.star_finder.estimator.observe((place.az_px, place.el_px), (0.0, 0.0))
-        self._is_recalled = True
-        self._journal.record(msgspec.structs.replace(place, time_s=self._clock.now_s()))
-        self._report_event(
-            "info",
-            "the star's place is known from before the supervisor was killed; acquire goes back there",
-        )
+        self._link_counts = True
 
     def release(self) -> None:
         """Send the D/A nothing more."""

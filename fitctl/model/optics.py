@@ -68,10 +68,6 @@ class Scales:
         """Beam angle on the sky of one radian of motor."""
         return self.motor_sky_rad_per_rad * ARCSEC_PER_RAD
 
-    def travel_rad(self, siderostat: Siderostat) -> float:
-        """Travel of a siderostat's motors, either way from the encoders' zero."""
-        return siderostat.travel_sky_arcsec / self.motor_sky_arcsec_per_rad
-
     # All of these take and give shape (..., 2).
 
     def motor_px(self, motor_rad: Floats) -> Floats:

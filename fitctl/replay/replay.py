@@ -160,7 +160,9 @@ class Replay:
         for name, mirror in self._mirrors.items():
             mirror.load_step(step)
             for place in step.of(StarPlace, name):
-                given = {field: getattr(place, field) for field in StarPlace.__struct_fields__}
+                given: dict[str, Any] = {
+                    field: getattr(place, field, 0.0) for field in StarPlace.__struct_fields__
+                }
                 supervisor.stellar_loops[name].recall(StarPlace(**given))
         for photodiodes in self._photodiodes.values():
             photodiodes.load_step(step)

@@ -157,8 +157,11 @@ class SiderostatServo:
         self._wanted_rad = (az_rad, el_rad)
 
     def recall(self, position_rad: AzEl) -> None:
-        """Compare the encoders, once they are read, with where they were when another supervisor was killed."""
-        self._recalled_rad = position_rad
+        """Until the encoders are read, they are where they were when another supervisor was killed.
+
+        The first reading is compared with that.
+        """
+        self._recalled_rad = self._position_rad = position_rad
 
     def stop(self) -> None:
         """Velocity zero from the next period on, until :meth:`hold`."""

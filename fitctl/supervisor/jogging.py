@@ -30,7 +30,7 @@ def jog_siderostats(rig: Rig, loops: Sequence[Loop], command: Jog) -> str:
         filter(None, (_beyond(rig, loop, step_sky_arcsec) for loop in loops)), ""
     )
     for loop in () if why_not else loops:
-        loop.siderostat.jog(step_sky_arcsec)
+        loop.jog(step_sky_arcsec)
     return why_not
 
 

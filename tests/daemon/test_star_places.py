@@ -14,6 +14,8 @@ PLACE = StarPlace(
     el_px=33.25,
     siderostat_az_rad=1.5,
     siderostat_el_rad=-2.5,
+    link_az_rad=0.25,
+    link_el_rad=-12.0,
 )
 
 

@@ -168,6 +168,66 @@ def test_the_search_goes_where_a_command_says():
     one.until(Mode.LOCKED, limit_s=5.0)
 
 
+def exhausted():
+    """A bench whose search has found nothing, and whose laser is back; its siderostat is far from the start."""
+    bench = Bench(offset_arcsec=(250.0, -100.0)).power_up()
+    bench.diodes.light = 0.0
+    bench.acquire().until(Mode.STANDBY, limit_s=60.0)
+    assert np.abs(bench.motors.position_rad).max() > 40.0
+    bench.diodes.light = 1.0
+    return bench
+
+
+def test_a_search_that_found_nothing_is_repeated_about_the_same_place():
+    bench = exhausted().acquire()
+    assert np.allclose(bench.loop.search.centre_rad, 0.0)
+    bench.until(Mode.LOCKED)
+    bench.loop.fire(Trigger.RELEASE, "test")
+    bench.acquire()
+    assert bench.loop.search.centre_rad == pytest.approx(bench.loop.servo.position_rad)
+
+
+def test_the_spiral_begins_when_the_siderostat_has_come_to_its_middle():
+    bench = exhausted()
+    bench.diodes.light = 0.0
+    bench.acquire()
+    bench.tick()
+    while bench.loop.search.progress == 0.0:
+        bench.tick()
+        assert bench.clock.now_s() < 100.0
+    capture_rad = 0.5 * bench.loop.search._plan.field_radius_px
+    away_px = np.abs(bench.loop.servo.position_rad).max() * bench.loop.search._px_per_motor_rad
+    assert away_px < 1.2 * capture_rad
+
+
+def test_a_search_ends_if_the_siderostat_does_not_come_to_its_middle():
+    search, motor_rad = Bench().loop.search, np.zeros(2)
+    asked = Acquire(expected_az_sky_arcsec=600.0, expected_el_sky_arcsec=0.0)
+    search.start_as_asked(asked, motor_rad, again=False)
+    for time_s in (0.0, 10.0):
+        search.advance_from(motor_rad, motor_rad, 0.02)
+        assert search.evaluate(False, motor_rad, time_s) is None
+    finding = search.evaluate(False, motor_rad, 1000.0)
+    assert finding.trigger is Trigger.SEARCH_EXHAUSTED
+    assert "did not reach the start of the search" in finding.reason
+
+
+def test_after_a_jog_the_search_begins_where_the_siderostat_was_turned_to():
+    bench = exhausted()
+    stood_rad = bench.loop.siderostat.setpoint_rad.copy()
+    bench.loop.jog(np.array([-20.0, 0.0]))
+    bench.run(1.0).acquire()
+    assert np.abs(bench.loop.search.centre_rad - stood_rad).max() < 10.0
+
+
+def test_encoders_that_lost_their_zero_begin_the_search_where_the_siderostat_is():
+    bench = exhausted()
+    bench.loop.servo.encoders_jumped = True
+    bench.loop.begin(None)
+    bench.acquire()
+    assert np.abs(bench.loop.search.centre_rad).max() > 40.0
+
+
 def test_the_tick_says_where_the_beam_is():
     one = bench().held().run(3.0)
     tick = one.ticks[-1]

@@ -165,6 +165,8 @@ def a_star_of_a_killed_supervisor(simulation):
         el_px=40.0,
         siderostat_az_rad=0.0,
         siderostat_el_rad=0.0,
+        link_az_rad=0.0,
+        link_el_rad=0.0,
     )
     simulation.supervisor.recall([place])
     hold_a_star(simulation)

@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 from instruments.simulated import darken, events_of, failing, mode_of, until
 
+from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.choose import design_for
 from fitctl.drivers.interface import DeviceFault
 from fitctl.messages.commands import Acquire, Off, Standby, Stop
 from fitctl.messages.modes import Mode
 from fitctl.model.optics import scales
 from fitctl.simulation.devices import InlineExecutor
+from fitctl.simulation.simulation import Simulation
 from fitctl.supervisor.supervisor import Supervisor
 
 KNOWN = "the star's place is known from before the supervisor was killed"
@@ -40,7 +42,8 @@ def searches_elsewhere(simulation):
 def killed(simulation, *, recall=True):
     """Another supervisor on the same devices, as the one before it left them."""
     places = simulation.supervisor.star_places
-    simulation.devices.loops["right"].amplifiers.disable()
+    for devices in simulation.devices.loops.values():
+        devices.amplifiers.disable()
     simulation.supervisor = Supervisor(
         simulation.rig,
         simulation.devices,
@@ -96,7 +99,10 @@ def test_a_supervisor_that_is_killed_before_it_opens_anything_passes_on_what_it_
     places = killed(simulation)
     simulation.run(2.0)
 
-    assert killed(simulation) == places != []
+    found = [
+        msgspec.structs.replace(place, time_s=places[0].time_s) for place in killed(simulation)
+    ]
+    assert found == places != []
     assert search_from_arcsec(simulation, held_arcsec) < 40.0
 
 
@@ -109,10 +115,10 @@ def test_without_it_the_search_begins_where_the_siderostat_stands(simulate_with)
     assert search_from_arcsec(simulation, held_arcsec) > 80.0
 
 
-def lose_zero(simulation):
+def lose_zero(simulation, name="right"):
     """From now on the encoders count from zero where the motors are."""
-    at_rad = simulation.supervisor.servos["right"].position_rad
-    amplifiers = simulation.devices.loops["right"].amplifiers
+    amplifiers = simulation.devices.loops[name].amplifiers
+    at_rad = amplifiers.exchange((0.0, 0.0)).position_rad
     exchange = amplifiers.exchange
 
     def from_zero(velocity_rad_s):
@@ -181,6 +187,76 @@ def test_a_place_of_before_the_computer_restarted_is_ignored(simulate_with):
     assert search_from_arcsec(simulation, held_arcsec) > 80.0
 
 
+def killed_while_the_link_searches(*, far_rad=20.0):
+    """A testbed whose laser is back; its supervisor was killed in a search for the beam, far from it."""
+    records = []
+    rig = load_rig(default_rig_path().with_name("fit-testbed.toml"), [])
+    simulation = Simulation(rig, 0, star_offset_px=(10.0, -6.0), record=records.append)
+    simulation.records = records
+    simulation.acquire()
+    until_all(simulation, metrology=Mode.LOCKED, left=Mode.VERNIER, right=Mode.VERNIER)
+    laser = simulation.plant.loops["metrology"].inputs.laser
+    servo = simulation.supervisor.servos["metrology"]
+    locked_rad, power = servo.position_rad, laser.copy()
+    laser[:] = 0.0
+    while np.abs(servo.position_rad - locked_rad).max() < far_rad:
+        simulation.run(0.1)
+        assert simulation.clock.now_s() < 200.0
+    places = killed(simulation)
+    laser[:] = power
+    return simulation, places
+
+
+def until_all(simulation, limit_s=60.0, **modes):
+    end_s, loops = simulation.clock.now_s() + limit_s, simulation.supervisor.loops
+    while any(loops[name].mode is not mode for name, mode in modes.items()):
+        assert simulation.clock.now_s() < end_s, {name: loops[name].mode for name in modes}
+        simulation.run(0.1)
+
+
+@pytest.mark.long
+def test_what_the_link_turns_until_it_holds_again_moves_the_place_of_the_star():
+    """Its siderostat goes on with its search before the loop's own search begins."""
+    simulation, _ = killed_while_the_link_searches()
+    simulation.command(Standby())
+    assert simulation.command(Acquire(loop="metrology")).accepted
+    simulation.run(1.0)
+    for name in ("left", "right"):
+        assert simulation.command(Acquire(loop=name)).accepted
+
+    until_all(simulation, metrology=Mode.LOCKED, left=Mode.VERNIER, right=Mode.VERNIER)
+    texts = [event.message for event in events_of(simulation) if event.source == "left"]
+    assert any(KNOWN in text for text in texts)
+
+
+@pytest.mark.long
+def test_a_place_with_the_link_goes_through_any_number_of_killed_supervisors():
+    simulation, places = killed_while_the_link_searches()
+    simulation.command(Standby(loop="metrology"))
+    simulation.command(Acquire(loop="metrology"))
+    simulation.run(0.5)
+    assert places[1].loop == "left"
+
+    killed(simulation)
+    simulation.acquire()
+    until_all(simulation, metrology=Mode.LOCKED, left=Mode.VERNIER, right=Mode.VERNIER)
+
+
+@pytest.mark.long
+def test_a_link_whose_encoders_lost_their_zero_leads_nowhere():
+    simulation, _ = killed_while_the_link_searches()
+    lose_zero(simulation, "metrology")
+    simulation.command(Standby(loop="left"))
+    assert {place.loop for place in simulation.supervisor.star_places} == {"left", "right"}
+
+    simulation.command(Standby(loop="metrology"))
+
+    assert {place.loop for place in simulation.supervisor.star_places} == {"right"}
+    simulation.run(0.1)
+    texts = [event.message for event in events_of(simulation) if event.source == "left"]
+    assert any("encoders of metrology" in text and FORGOTTEN in text for text in texts)
+
+
 def test_a_place_says_where_the_motors_were(simulate_with):
     simulation = simulate_with(star_offset_px=(10.0, -6.0))
     simulation.acquire()
@@ -189,6 +265,7 @@ def test_a_place_says_where_the_motors_were(simulate_with):
     (place,) = simulation.supervisor.star_places
 
     assert place.loop == "right"
+    assert (place.link_az_rad, place.link_el_rad) == (0.0, 0.0)
     motor_rad = simulation.supervisor.servos["right"].position_rad
     assert (place.siderostat_az_rad, place.siderostat_el_rad) == tuple(motor_rad)
     assert math.isfinite(place.az_px + place.el_px)

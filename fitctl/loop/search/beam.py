@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from fitctl.config import Rig
+import numpy as np
+from numpy.typing import NDArray
+
+from fitctl.config import ARCSEC_PER_RAD, Rig
 from fitctl.controllers.spiral import plan_beam_spiral
 from fitctl.loop.search.spiral import SpiralSearch, Wanted
-from fitctl.messages.modes import Trigger
+from fitctl.messages.commands import Acquire
+from fitctl.messages.modes import Finding, Trigger
 from fitctl.model.optics import motor_sky_rad_per_rad, sky_px_per_rad
 
+Floats = NDArray[np.float64]
 _CHECK = "the laser and its path"
 _BEAM = Wanted(
     name="beam",
@@ -19,13 +24,50 @@ _BEAM = Wanted(
 )
 
 
-def beam_search(rig: Rig, loop_name: str) -> SpiralSearch:
-    """The search of a metrology loop."""
-    loop = rig.metrology_loops[loop_name]
-    rad_per_px = 1.0 / (motor_sky_rad_per_rad(loop.siderostat) * sky_px_per_rad(rig))
-    return SpiralSearch(
-        _BEAM,
-        loop.acquisition,
-        lambda radius: plan_beam_spiral(rig, loop_name, radius_sky_arcsec=radius),
-        lambda offset_px: rad_per_px * offset_px,
-    )
+class BeamSearch(SpiralSearch):
+    """One metrology loop's; :meth:`start_as_asked` begins it anew.
+
+    Parameters
+    ----------
+    rig : Rig
+    loop_name : str
+    """
+
+    def __init__(self, rig: Rig, loop_name: str) -> None:
+        loop = rig.metrology_loops[loop_name]
+        self._motor_sky = motor_sky_rad_per_rad(loop.siderostat)
+        px_per_motor_rad = self._motor_sky * sky_px_per_rad(rig)
+        self._unfound_rad: Floats | None = None  # the middle of a search that did not find the beam
+        super().__init__(
+            _BEAM,
+            loop.acquisition,
+            lambda radius: plan_beam_spiral(rig, loop_name, radius_sky_arcsec=radius),
+            lambda offset_px: offset_px / px_per_motor_rad,
+            loop.siderostat,
+            px_per_motor_rad,
+        )
+
+    def start_as_asked(self, asked: Acquire, motor_rad: Floats, *, again: bool) -> None:
+        """A new search: where a command asks; else where the last one did not find the beam; else here.
+
+        Here, with the motors at `motor_rad`, shape (2,), is the last place of a beam that was lost.
+        """
+        centre_rad = motor_rad if self._unfound_rad is None else self._unfound_rad
+        if asked.expected_az_sky_arcsec is not None and asked.expected_el_sky_arcsec is not None:
+            expected = np.array([asked.expected_az_sky_arcsec, asked.expected_el_sky_arcsec])
+            centre_rad = expected / ARCSEC_PER_RAD / self._motor_sky
+        self._unfound_rad = centre_rad
+        self.start(centre_rad, again=again, radius_sky_arcsec=asked.search_radius_sky_arcsec)
+
+    def forget(self) -> None:
+        """The next search begins where the siderostat then is."""
+        self._unfound_rad = None
+
+    def evaluate(self, has_light: bool, motor_rad: Floats, now_s: float) -> Finding | None:
+        """What a sample taken at `now_s`, with the motors at `motor_rad`, means for the search."""
+        if not (has_light or self._candidate or self._arrived):
+            return self._wait_for_siderostat(now_s)
+        finding = self.look(has_light, motor_rad, now_s)
+        if finding is not None and finding.trigger is Trigger.BEAM_FOUND:
+            self.forget()
+        return finding

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Loop, MetrologyLoop
+from fitctl.config.devices import AnySiderostat
 from fitctl.config.loops import Acquisition
 from fitctl.controllers.frame_counts import CONFIRMED, REJECTED, look_again
 from fitctl.controllers.search_rounds import WIDEST_ROUND, round_fraction
@@ -24,6 +25,8 @@ from fitctl.messages.modes import Finding, Trigger
 from fitctl.messages.telemetry import SearchAgain
 
 Floats = NDArray[np.float64]
+_SLEWS = 10.0  # the siderostat may take as many times as long to begin as its limits would let it
+NEAR = 0.5  # of the field's radius: so near to its middle the siderostat must be before the spiral begins
 
 
 class Wanted(NamedTuple):
@@ -68,6 +71,8 @@ class SpiralSearch:
         The spiral of a search radius, arcsec on the sky.
     motor_rad : callable
         Motor angles of pixels in the focal plane, both of shape (2,).
+    siderostat : AnySiderostat
+    px_per_motor_rad : float
 
     Attributes
     ----------
@@ -83,6 +88,8 @@ class SpiralSearch:
         settings: Acquisition,
         plan: Callable[[float], SpiralPlan],
         motor_rad: Callable[[Floats], Floats],
+        siderostat: AnySiderostat,
+        px_per_motor_rad: float,
     ) -> None:
         self.centre_rad = np.zeros(2)
         self.again = False
@@ -90,6 +97,11 @@ class SpiralSearch:
         self._settings = settings
         self._make_plan = plan
         self._motor_rad = motor_rad
+        self._px_per_motor_rad = px_per_motor_rad
+        self._travel_rad = siderostat.travel_rad
+        self._slew_limit_s = _SLEWS * 2 * self._travel_rad / siderostat.velocity_limit_rad_s
+        self._arrived = False
+        self._slews_since_s = math.nan
         self._radius_sky_arcsec = settings.search_radius_sky_arcsec
         self._plan = plan(self._radius_sky_arcsec)
         self._spiral = Spiral(self._plan)
@@ -116,6 +128,8 @@ class SpiralSearch:
         self._radius_sky_arcsec = radius_sky_arcsec or self._settings.search_radius_sky_arcsec
         self._since_s = math.nan
         self._candidate = None
+        self._arrived = self.again  # whatever is near the last place may be what was lost
+        self._slews_since_s = math.nan
         self._begin_round(0)
 
     def _begin_round(self, number: int) -> None:
@@ -195,6 +209,45 @@ class SpiralSearch:
             pauses=self._pause_s > 0,
             limit_s=self._settings.search_again_s,
         )
+
+    def is_near(self, motor_rad: Floats, place_rad: Floats) -> bool:
+        """Whether the siderostat, at `motor_rad`, is so near to a place that it has arrived there."""
+        away_px = float(np.abs(motor_rad - place_rad).max()) * self._px_per_motor_rad
+        return away_px <= NEAR * self._plan.field_radius_px
+
+    def has_arrived(self, motor_rad: Floats, beam_rad: Floats) -> bool:
+        """Whether the siderostat, which was at `motor_rad`, has come near where the spiral begins or goes on.
+
+        With what else turns the star, it was at `beam_rad`, as the spiral's places are. Beyond its travel it
+        does not come nearer than its travel's end.
+
+        On its way from another star it would see that one, and a spiral that had begun would have passed
+        the middle by. On its way from a candidate that was rejected, another one would turn it round at its
+        full speed, which its motors cannot follow.
+        """
+        if not self._arrived:
+            own_rad = self._spiral_place_rad() - (beam_rad - motor_rad)
+            own_rad = np.clip(own_rad, -self._travel_rad, self._travel_rad)
+            self._arrived = self.is_near(motor_rad, own_rad)
+        return self._arrived
+
+    def _wait_for_siderostat(self, now_s: float) -> Finding | None:
+        """Until it has arrived, that the search is over at `now_s` if that took too long."""
+        if math.isnan(self._slews_since_s):
+            self._slews_since_s = now_s
+        if now_s - self._slews_since_s <= self._slew_limit_s:
+            return None
+        return Finding(
+            Trigger.SEARCH_EXHAUSTED,
+            "the siderostat did not reach the start of the search, or the place to continue it, within "
+            f"{self._slew_limit_s:.0f} s; check that its motors turn, then stop, recover and acquire again",
+        )
+
+    def advance_from(self, motor_rad: Floats, beam_rad: Floats, duration_s: float) -> Floats:
+        """As :meth:`advance`, but on the way to the spiral until the siderostat has arrived there."""
+        if self._candidate is None and not self.has_arrived(motor_rad, beam_rad):
+            return self._spiral_place_rad()
+        return self.advance(duration_s)
 
     def advance(self, duration_s: float) -> Floats:
         """Go on for `duration_s`, or wait where something was seen; motor set-point, shape (2,)."""

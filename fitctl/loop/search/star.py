@@ -19,8 +19,6 @@ from fitctl.messages.modes import Finding, Trigger
 from fitctl.model.optics import scales
 
 Floats = NDArray[np.float64]
-_SLEWS = 10.0  # the siderostat may take as many times as long to begin as its limits would let it
-NEAR = 0.5  # of the field's radius: so near to its middle the siderostat must be before the spiral begins
 _CHECK_COLLECTOR = (
     "shutter and pointing, and bring the collector back with fitctl send collector reference if it moved while "
     "its beam was not held"
@@ -61,22 +59,20 @@ class StarSearch(SpiralSearch):
         self._middle_px = np.array([rig.camera.width_px - 1, rig.camera.height_px - 1]) / 2
         scale = scales(rig, loop)
         self._scale = scale
-        self._travel_rad = scale.travel_rad(loop.siderostat)
-        self._slew_limit_s = _SLEWS * 2 * self._travel_rad / loop.siderostat.velocity_limit_rad_s
-        self._arrived = False
         self.sky_rad = np.zeros(2)
-        self._slews_since_s = math.nan
         self._asked = Acquire()
         self._overlap: float | None = None
         # What moved the light without a held beam turned the star by as much.
         moves = loop.link is not None and rig.collector is not None
         wanted = _STAR._replace(check=_CHECK_COLLECTOR) if moves else _STAR
-        super().__init__(wanted, loop.acquisition, self._plan_spiral, scale.motor_rad)
-
-    def is_near(self, motor_rad: Floats, place_rad: Floats) -> bool:
-        """Whether the siderostat, at `motor_rad`, is so near to a place that it has arrived there."""
-        away_px = float(np.abs(motor_rad - place_rad).max()) * self._scale.motor_px_per_rad
-        return away_px <= NEAR * self._plan.field_radius_px
+        super().__init__(
+            wanted,
+            loop.acquisition,
+            self._plan_spiral,
+            scale.motor_rad,
+            loop.siderostat,
+            scale.motor_px_per_rad,
+        )
 
     def _plan_spiral(self, radius_sky_arcsec: float) -> SpiralPlan:
         return plan_spiral(
@@ -115,21 +111,6 @@ class StarSearch(SpiralSearch):
             again=again,
             radius_sky_arcsec=asked.search_radius_sky_arcsec,
         )
-        self._arrived = self.again  # whatever is near the last place may be the star
-        self._slews_since_s = math.nan
-
-    def has_arrived(self, motor_rad: Floats) -> bool:
-        """Whether the siderostat, which was at `motor_rad`, has come near where the spiral begins or goes on.
-
-        On its way from another star it would see that one, and a spiral that had begun would have passed
-        the middle by. On its way from a candidate that was rejected, another one would turn it round at its
-        full speed, which its motors cannot follow.
-        """
-        if not self._arrived:
-            own_rad = self._spiral_place_rad() - self.sky_rad
-            place_rad = np.clip(own_rad, -self._travel_rad, self._travel_rad) + self.sky_rad
-            self._arrived = self.is_near(motor_rad, place_rad)
-        return self._arrived
 
     def evaluate(self, star: Star | None, now_s: float) -> Finding | None:
         """What a frame exposed at `now_s` means for the search."""
@@ -163,23 +144,6 @@ class StarSearch(SpiralSearch):
         super()._begin_round(number)
         if self._attribution is not None:
             self._attribution.begin_round()
-
-    def _wait_for_siderostat(self, now_s: float) -> Finding | None:
-        if math.isnan(self._slews_since_s):
-            self._slews_since_s = now_s
-        if now_s - self._slews_since_s <= self._slew_limit_s:
-            return None
-        return Finding(
-            Trigger.SEARCH_EXHAUSTED,
-            "the siderostat did not reach the start of the search, or the place to continue it, within "
-            f"{self._slew_limit_s:.0f} s; check that its motors turn, then stop, recover and acquire again",
-        )
-
-    def advance_from(self, motor_rad: Floats, duration_s: float) -> Floats:
-        """As :meth:`advance`, but on the way to the spiral until the siderostat, at `motor_rad`, is there."""
-        if not self.has_arrived(motor_rad):
-            return self._spiral_place_rad()
-        return self.advance(duration_s)
 
     def _star_on_target_rad(self) -> Floats:
         return self._estimator.motor_for_rad(self._target_px, np.zeros(2))

@@ -47,9 +47,9 @@ def has_arrived(s: Any, r: Any) -> bool:
         away_rad = 0.0
         spiral_rad = spiral_place_rad(s, r)
         for axis in range(2):
-            sky_rad = s.sky_rad_s[axis] * r.sky_time_s
-            place_rad = max(-s.travel_rad, min(s.travel_rad, spiral_rad[axis] - sky_rad)) + sky_rad
-            away_rad = max(away_rad, abs(r.beam_rad[axis] - place_rad))
+            beside_rad = r.beam_rad[axis] - r.motor_rad[axis]
+            own_rad = max(-s.travel_rad, min(s.travel_rad, spiral_rad[axis] - beside_rad))
+            away_rad = max(away_rad, abs(r.motor_rad[axis] - own_rad))
         r.has_arrived = away_rad * s.scale.motor_px_per_rad <= s.near_px
     return bool(r.has_arrived)
 

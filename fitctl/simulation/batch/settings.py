@@ -25,7 +25,7 @@ from fitctl.controllers.spot_fit import PLACES
 from fitctl.loop.learning import MOST_NOISE_RATIO
 from fitctl.loop.metrology import PULL_IN
 from fitctl.loop.pointing import Pointing
-from fitctl.loop.search.star import NEAR
+from fitctl.loop.search.spiral import NEAR
 from fitctl.loop.sky import sky_rad_s
 from fitctl.model.compiled import record
 from fitctl.model.image.light import light_table
