@@ -14,6 +14,7 @@ from unittest.mock import patch
 from fitctl.config import Rig
 from fitctl.controllers.position_servo import PositionServo
 from fitctl.drivers.interface import AzEl, Frame, ServoReading
+from fitctl.logging.records import StarPlace
 from fitctl.loop.loop import Loop
 from fitctl.loop.observation import Observation
 from fitctl.loop.stellar import StellarLoop
@@ -184,7 +185,22 @@ def _find_nothing(self: MirrorStage) -> None:
     self._known_s = self._clock.now_s()
 
 
+def _recalls_without_link(self: StellarLoop, place: StarPlace) -> None:
+    _RECALL(self, place)
+    self._link_counts = False
+
+
+def _counts_from_the_search(self: StellarLoop, motor_rad: Any) -> None:
+    known = self.star_finder.estimator.origin_px is not None
+    if self.link is not None and known and not self._link_counts:
+        self.link.set_origin()
+        self._link_counts = True
+    _START_SEARCH(self, motor_rad)
+
+
 _ASK = PiezoWatch.ask
+_RECALL = StellarLoop.recall
+_START_SEARCH = StellarLoop._start_search
 _EVALUATE_WAITING = StellarLoop._evaluate_waiting
 _SERVO_INIT = SiderostatServo.__init__
 _FIND_POSITION = SiderostatServo._find_position
@@ -285,6 +301,14 @@ DEFECTS = {
         "029a746",
         "a supervisor that follows a killed one does not know where the star was",
         [(Supervisor, "recall", lambda _self, _places: None)],
+    ),
+    "link-counts-late": Defect(
+        "ebad60e7",
+        "behind a supervisor that was killed, what a link turns before the first search counts for nothing",
+        [
+            (StellarLoop, "recall", _recalls_without_link),
+            (StellarLoop, "_start_search", _counts_from_the_search),
+        ],
     ),
     "moves-in-a-fault": Defect(
         "bf6a8c0",

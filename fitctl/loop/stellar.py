@@ -554,9 +554,9 @@ class StellarLoop(Loop):
 
     def _search(self, observation: Observation) -> None:
         self.mirror.step_to_rest()
-        wanted_rad = self.search.advance_from(
-            observation.motor_rad, observation.beam_rad, self._period_s
-        )
+        # If the search has begun in this tick, what the link turns counts from elsewhere than when it was read.
+        beam_rad = self._beam_rad(observation.motor_rad)
+        wanted_rad = self.search.advance_from(observation.motor_rad, beam_rad, self._period_s)
         if self.link is not None:
             wanted_rad = wanted_rad - self.link.undone_from_origin_rad
         if self.sky is not None:

@@ -703,6 +703,18 @@ FOUND = {
         ),
         "healed, every star is held within 60 s",
     ),
+    "link-counts-late": (
+        plan(
+            *[gives(2.0 * number, None) for number in range(6)],
+            Cloud(at_s=14.0, lasts_s=50.0, part=0.0),
+            gives(15.0, Stop(loop="metrology")),  # else its search begins with small rounds
+            *[gives(at_s, None) for at_s in (16.0, 17.0, 18.0)],
+            Kill(at_s=28.0, back_after_s=0.1),
+            duration_s=29.0,
+            rig="fit-testbed.toml",
+        ),
+        "healed, every star is held within 60 s",
+    ),
     "follows-what-rests": (
         plan(
             *[gives(at_s, None) for at_s in (3.2188, 7.986, 10.3929)],

@@ -19,7 +19,7 @@ _BEAM = Wanted(
     found=Trigger.BEAM_FOUND,
     confirmed="light on {} samples in a row",
     rejected="light was not confirmed; the search for the beam goes on",
-    check=_CHECK,
+    check=f"{_CHECK}, and give expected_az_sky_arcsec and expected_el_sky_arcsec if the beam is elsewhere",
     check_long=_CHECK,
 )
 

@@ -103,6 +103,7 @@ def start_search(s: Any, r: Any, rr: Any, motor_az_rad: float, motor_el_rad: flo
         r.spiral_centre_rad[0], r.spiral_centre_rad[1] = star_at_rad(s, r, s.middle_px)
     r.again = 1 if again and s.search_again_s != 0 else 0
     r.has_arrived, r.has_candidate, r.search_since_s = r.again, 0, math.nan
+    r.beam_rad[0], r.beam_rad[1] = linked_rad(s, r, r.motor_rad[0], r.motor_rad[1])
     begin_round(s, r, 0)
 
 
