@@ -756,7 +756,7 @@ class StellarLoop(Loop):
         az_rad, el_rad = self.servo.position_rad.tolist()
         link_motor_rad = link_rad = np.zeros(2)
         if self.link is not None:
-            link_motor_rad = self.link.loop.servo.position_rad
+            link_motor_rad = self.link.servo.position_rad
             link_rad = self.link.turned_with(link_motor_rad)
         link_az_px, link_el_px = estimator.stages_px(link_rad, np.zeros(2))
         link_az_rad, link_el_rad = link_motor_rad.tolist()

@@ -160,6 +160,7 @@ class Replay:
         for name, mirror in self._mirrors.items():
             mirror.load_step(step)
             for place in step.of(StarPlace, name):
+                # A log from before 2026-11-29 does not say where the link's siderostat was.
                 given: dict[str, Any] = {
                     field: getattr(place, field, 0.0) for field in StarPlace.__struct_fields__
                 }

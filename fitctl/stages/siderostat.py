@@ -39,7 +39,7 @@ class SiderostatStage:
         self.setpoint_rad = np.zeros(2)
         self.wanted_fraction = 0.0
         self._motor_sky_arcsec_per_rad = motor_sky_rad_per_rad(siderostat) * ARCSEC_PER_RAD
-        self.travel_rad = siderostat.travel_sky_arcsec / self._motor_sky_arcsec_per_rad
+        self.travel_rad = siderostat.travel_rad
 
     def hold(self, motor_rad: Floats) -> None:
         """Servo about where the motors are, shape (2,)."""

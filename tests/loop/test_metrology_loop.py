@@ -8,6 +8,7 @@ from beam_bench import Bench
 
 from fitctl.drivers.interface import DeviceTimeout
 from fitctl.logging.records import DeviceFailure, Event, ModeChange
+from fitctl.loop.search.spiral import NEAR
 from fitctl.messages.commands import Acquire
 from fitctl.messages.modes import Mode, Trigger
 
@@ -195,9 +196,9 @@ def test_the_spiral_begins_when_the_siderostat_has_come_to_its_middle():
     while bench.loop.search.progress == 0.0:
         bench.tick()
         assert bench.clock.now_s() < 100.0
-    capture_rad = 0.5 * bench.loop.search._plan.field_radius_px
+    near_px = NEAR * bench.loop.search._plan.field_radius_px
     away_px = np.abs(bench.loop.servo.position_rad).max() * bench.loop.search._px_per_motor_rad
-    assert away_px < 1.2 * capture_rad
+    assert away_px < 1.2 * near_px
 
 
 def test_a_search_ends_if_the_siderostat_does_not_come_to_its_middle():

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import ARCSEC_PER_RAD, Rig
+from fitctl.config import Rig
 from fitctl.controllers.spiral import plan_beam_spiral
-from fitctl.loop.search.spiral import SpiralSearch, Wanted
+from fitctl.loop.search.spiral import SpiralSearch, Wanted, asked_place_sky_arcsec
 from fitctl.messages.commands import Acquire
 from fitctl.messages.modes import Finding, Trigger
-from fitctl.model.optics import motor_sky_rad_per_rad, sky_px_per_rad
+from fitctl.model.optics import sky_px_per_rad
 
 Floats = NDArray[np.float64]
 _CHECK = "the laser and its path"
@@ -35,15 +35,16 @@ class BeamSearch(SpiralSearch):
 
     def __init__(self, rig: Rig, loop_name: str) -> None:
         loop = rig.metrology_loops[loop_name]
-        self._motor_sky = motor_sky_rad_per_rad(loop.siderostat)
-        px_per_motor_rad = self._motor_sky * sky_px_per_rad(rig)
+        siderostat = loop.siderostat
+        self._sky_arcsec_per_motor_rad = siderostat.sky_arcsec_per_motor_rad
+        px_per_motor_rad = siderostat.sky_rad_per_motor_rad * sky_px_per_rad(rig)
         self._unfound_rad: Floats | None = None  # the middle of a search that did not find the beam
         super().__init__(
             _BEAM,
             loop.acquisition,
             lambda radius: plan_beam_spiral(rig, loop_name, radius_sky_arcsec=radius),
             lambda offset_px: offset_px / px_per_motor_rad,
-            loop.siderostat,
+            siderostat,
             px_per_motor_rad,
         )
 
@@ -53,9 +54,9 @@ class BeamSearch(SpiralSearch):
         Here, with the motors at `motor_rad`, shape (2,), is the last place of a beam that was lost.
         """
         centre_rad = motor_rad if self._unfound_rad is None else self._unfound_rad
-        if asked.expected_az_sky_arcsec is not None and asked.expected_el_sky_arcsec is not None:
-            expected = np.array([asked.expected_az_sky_arcsec, asked.expected_el_sky_arcsec])
-            centre_rad = expected / ARCSEC_PER_RAD / self._motor_sky
+        place_sky_arcsec = asked_place_sky_arcsec(asked)
+        if place_sky_arcsec is not None:
+            centre_rad = place_sky_arcsec / self._sky_arcsec_per_motor_rad
         self._unfound_rad = centre_rad
         self.start(centre_rad, again=again, radius_sky_arcsec=asked.search_radius_sky_arcsec)
 

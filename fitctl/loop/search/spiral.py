@@ -264,6 +264,12 @@ class SpiralSearch:
         return self.centre_rad + self._motor_rad(self._spiral.position_px())
 
 
+def asked_place_sky_arcsec(asked: Acquire) -> Floats | None:
+    """Where a command asks for a search, shape (2,), from the encoders' zero; None without a place."""
+    az, el = asked.expected_az_sky_arcsec, asked.expected_el_sky_arcsec
+    return None if az is None or el is None else np.array([az, el])
+
+
 def refused_area(settings: Loop | MetrologyLoop, name: str, asked: Acquire) -> str:
     """Why a search cannot be made where a command asks for it, or nothing."""
     expected = [asked.expected_az_sky_arcsec, asked.expected_el_sky_arcsec]

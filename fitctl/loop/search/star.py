@@ -12,7 +12,12 @@ from fitctl.controllers.centroid import LARGEST_PEAK, Star
 from fitctl.controllers.spiral import SpiralPlan, plan_spiral
 from fitctl.loop.search.attribution import Attribution
 from fitctl.loop.search.finder import StarFinder
-from fitctl.loop.search.spiral import SpiralSearch, Wanted, refused_area
+from fitctl.loop.search.spiral import (
+    SpiralSearch,
+    Wanted,
+    asked_place_sky_arcsec,
+    refused_area,
+)
 from fitctl.loop.sky import sky_rad_s
 from fitctl.messages.commands import Acquire
 from fitctl.messages.modes import Finding, Trigger
@@ -89,8 +94,7 @@ class StarSearch(SpiralSearch):
     @property
     def asked_place_sky_arcsec(self) -> Floats | None:
         """Where the next search is to begin, as a command asked; shape (2,)."""
-        az, el = self._asked.expected_az_sky_arcsec, self._asked.expected_el_sky_arcsec
-        return None if az is None or el is None else np.array([az, el])
+        return asked_place_sky_arcsec(self._asked)
 
     def start_where_expected(self, *, again: bool = False) -> None:
         """A new search, about where the star is expected now, or as a command asked.

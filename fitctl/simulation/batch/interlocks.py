@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import math
 
-from fitctl.config import ARCSEC_PER_RAD, QUANTITIES, Rig
+from fitctl.config import QUANTITIES, Rig
 from fitctl.loop.quantities import metrology_places, stellar_places
-from fitctl.model.optics import motor_sky_rad_per_rad
 
 
 def acting_interlocks(rig: Rig, loop_name: str) -> list[str]:
     """Interlocks of a loop that do more than warn, and that a simulated run without them might have tripped."""
     siderostat, camera = rig.loops[loop_name].siderostat, rig.camera
-    travel_rad = siderostat.travel_sky_arcsec / ARCSEC_PER_RAD / motor_sky_rad_per_rad(siderostat)
     rate_rad_s = siderostat.velocity_limit_rad_s
     count_rad = siderostat.encoder_count_rad
     truth, _ = rig.mock_parts()
@@ -25,7 +23,7 @@ def acting_interlocks(rig: Rig, loop_name: str) -> list[str]:
     late_s = rig.true_camera.frame_delay_s - camera.frame_delay_s
     # How far each gets while nothing fails; its set-points are limited, and it counts in steps.
     reached = {
-        "siderostat_travel_fraction": (0.0, 1 + 3 * count_rad / travel_rad),
+        "siderostat_travel_fraction": (0.0, 1 + 3 * count_rad / siderostat.travel_rad),
         "siderostat_rate_fraction": (0.0, 1 + count_rad / camera.period_s / rate_rad_s),
         "frame_late_s": (late_s - 1e-9, late_s + 1e-9),
         "frame_interval_periods": (0.999, 1.001),

@@ -429,7 +429,6 @@ def _siderostat(rig: Rig, loop_name: str) -> dict[str, Any]:
     if readings > MOST_HISTORY:
         msg = f"its rates give {readings} readings to remember; the batch holds {MOST_HISTORY}"
         raise BatchRefusalError(msg)
-    motor_sky_arcsec = motor_sky_rad_per_rad(siderostat) * ARCSEC_PER_RAD
     return {
         "servo": _fields(
             servo,
@@ -441,7 +440,7 @@ def _siderostat(rig: Rig, loop_name: str) -> dict[str, Any]:
             "periods_per_setpoint",
             "resolution_rad",
         ),
-        "travel_rad": siderostat.travel_sky_arcsec / motor_sky_arcsec,
+        "travel_rad": siderostat.travel_rad,
         "readings": readings,
         "following_limit_rad": siderostat.servo.following_error_limit_rad,
         "following_s": FOLLOWING_S,
