@@ -12,7 +12,9 @@ from typing import Any, ClassVar, cast
 import msgspec
 from textual.app import App, SystemCommand
 from textual.binding import Binding, BindingType
+from textual.notifications import Notification, Notify, SeverityLevel
 from textual.screen import Screen
+from textual.widgets._toast import Toast
 
 from fitctl.messages.client import Client
 from fitctl.messages.command_table import ROWS, WORDS, command_of
@@ -55,6 +57,7 @@ from fitctl.tui.wire import UNREADABLE_NOTICE_S, NoLink, Wire
 
 BEAT_S = 0.1
 """How often something is drawn, if the machine allows; a panel says at which of these beats."""
+_NEVER_S = 1e9  # when Textual would let go of a notice by itself
 KEEP_S = 4.0  # a console that is open keeps the lease of its user; less than the shortest lease
 
 
@@ -158,6 +161,7 @@ class ConsoleApp(App[None]):
             draw=self.draw_all,
         )
         self._beat = 0
+        self._notice_s: dict[str, float] = {}  # of those that are not on the screen yet
         self.pace = Pace()
         self._wire = Wire(
             link,
@@ -219,7 +223,34 @@ class ConsoleApp(App[None]):
         bottom = self.screen_stack[:1]  # while screens are changed there is none
         return bottom[0] if bottom and isinstance(bottom[0], View) else None
 
+    def notify(
+        self,
+        message: str,
+        *,
+        title: str = "",
+        severity: SeverityLevel = "information",
+        timeout: float | None = None,
+        markup: bool = True,
+    ) -> None:
+        """Show a notice for `timeout` s, which count from when it is on the screen.
+
+        Textual's count from when it is raised. On a busy machine they can be over before it is drawn, and an
+        operator would not learn that a STOP is confirmed.
+        """
+        notice = Notification(message, title, severity, _NEVER_S, markup=markup)
+        self._notice_s[notice.identity] = self.NOTIFICATION_TIMEOUT if timeout is None else timeout
+        self.post_message(Notify(notice))
+
+    def _time_notices(self) -> None:
+        """Begin to count the time of those that have come onto the screen."""
+        top = self.screen_stack[-1:]  # while screens are changed there is none
+        for toast in top[0].query(Toast) if top else ():
+            notice = toast._notification  # Textual has no public way to what a toast shows
+            if toast.size.area and notice.identity in self._notice_s:
+                self.set_timer(self._notice_s.pop(notice.identity), partial(self._unnotify, notice))
+
     def _draw_due(self) -> None:
+        self._time_notices()
         if self.pace.due():
             self._beat += 1
             self._draw(self._beat)

@@ -60,5 +60,11 @@ def header_text(app: ConsoleApp) -> str:
     )
 
 
+def screen_text(app: ConsoleApp) -> str:
+    """What is on the screen now, line by line."""
+    strips = app.screen._compositor.render_strips()
+    return "\n".join("".join(segment.text for segment in strip) for strip in strips)
+
+
 def notifications(app: ConsoleApp) -> str:
     return "\n".join(f"{note.title}: {note.message}" for note in app._notifications)

@@ -19,7 +19,7 @@ from fitctl.tui.dialogs import events_text
 from fitctl.tui.wire import UNDRAWN_MESSAGES
 from tests.instruments.fake_supervisor import START_S, FakeSupervisor
 from tests.tui.links import FakeLink
-from tests.tui.live import DEADLINE_S, Clock, header_text, notifications, run, until
+from tests.tui.live import DEADLINE_S, Clock, header_text, notifications, run, screen_text, until
 
 
 def test_stop_does_not_wait_for_commands_without_an_answer():
@@ -67,6 +67,20 @@ def test_a_stop_that_nobody_answers_or_that_fails_is_told_as_a_danger(error, tol
         assert "may still move" in notifications(app)
 
     run(scenario, link=FakeLink(fails))
+
+
+def test_the_time_of_a_notice_counts_from_when_it_is_on_the_screen():
+    async def scenario(app, pilot, link):
+        with app.batch_update():  # nothing is drawn, as when other programs keep the processor busy
+            app.notify("all loops go to SAFE", title="STOP confirmed", timeout=0.3)
+            await until(pilot, lambda: "STOP confirmed" in notifications(app))
+            await asyncio.sleep(0.6)
+            assert "STOP confirmed" not in screen_text(app)
+        await until(pilot, lambda: "STOP confirmed" in screen_text(app))
+        await until(pilot, lambda: "STOP confirmed" not in screen_text(app))
+        assert not notifications(app)
+
+    run(scenario)
 
 
 def test_old_data_are_said_to_be_old_and_new_data_end_it():

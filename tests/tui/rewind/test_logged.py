@@ -41,7 +41,7 @@ from tests.instruments.fake_supervisor import (
 from tests.samples.log_samples import SETTINGS
 from tests.tui.drawn import plain
 from tests.tui.fixed import FakeJob, PromptPlayer
-from tests.tui.live import until
+from tests.tui.live import screen_text, until
 
 RIG_JSON = load_rig(default_rig_path()).model_dump_json()
 PANELS = (Traces, Stages, Devices, Timing, Events, DeviceList, Readings, Histograms, Breakdown)
@@ -277,11 +277,7 @@ def test_a_hostile_log_stays_harmless(tmp_path, seed):
                     await pilot.pause()
                     app.draw_all()
                 await pilot.press("down", "enter", "escape")
-            text = "".join(
-                segment.text
-                for strip in app.screen._compositor.render_strips()
-                for segment in strip
-            )
+            text = screen_text(app)
             assert "\x1b" not in text
             assert "LOG" in text
 

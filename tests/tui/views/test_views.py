@@ -6,6 +6,7 @@ from fitctl.messages.commands import Release, Stop
 from fitctl.tui.commands import KEYS, OPERATOR_COMMANDS, SCREENS, keys_of
 from fitctl.tui.widgets.keys import Keys
 from tests.tui.fixed import settle
+from tests.tui.live import screen_text
 from tests.tui.piloted import pressed, run, sent
 
 # ---------------------------------------------------------------- screens
@@ -119,10 +120,7 @@ def test_the_past_is_left_from_the_help_too():
 def test_every_key_is_in_the_help():
     async def scenario(app, pilot):
         await pressed(app, pilot, "6")
-        told = "\n".join(
-            "".join(segment.text for segment in strip)
-            for strip in app.screen._compositor.render_strips()
-        )
+        told = screen_text(app)
         for key in KEYS:
             assert key.label in told
         for command in OPERATOR_COMMANDS:
