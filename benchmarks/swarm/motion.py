@@ -96,15 +96,17 @@ class Motion:
         self._three_periods_s = {
             name: 3 / loop.siderostat.servo.rate_hz for name, loop in rig.loops.items()
         }
-        self._travel_rad, self._coasts_rad, self._moved_s = {}, {}, {}
+        self._travel_rad, self._farthest_rad, self._moved_s = {}, {}, {}
+        self._turned_rad: dict[str, list[float]] = {}  # by loop: beyond its travel, how far it was
         for name, loop in rig.loops.items():
             siderostat = loop.siderostat
             sky_arcsec_per_rad = motor_sky_rad_per_rad(siderostat) * ARCSEC_PER_RAD
-            self._travel_rad[name] = siderostat.travel_sky_arcsec / sky_arcsec_per_rad
+            self._travel_rad[name] = travel_rad = siderostat.travel_sky_arcsec / sky_arcsec_per_rad
             # A servo acts on readings of up to this age, and its command takes up to three periods to arrive.
             unseen_s = self._three_periods_s[name] + 1 / siderostat.servo.gain_per_s
-            self._coasts_rad[name] = siderostat.velocity_limit_rad_s * unseen_s
-            crossing_s = 2 * self._travel_rad[name] / siderostat.velocity_limit_rad_s
+            self._farthest_rad[name] = travel_rad + siderostat.velocity_limit_rad_s * unseen_s
+            self._turned_rad[name] = [self._farthest_rad[name]] * 2
+            crossing_s = 2 * travel_rad / siderostat.velocity_limit_rad_s
             self._moved_s[name] = crossing_s + _MOVED_S
         self._velocity_step_rad_s = {
             name: loop.siderostat.acceleration_limit_rad_s2 / loop.siderostat.servo.rate_hz * _SLACK
@@ -155,22 +157,29 @@ class Motion:
                 )
 
     def _within_travel(self, name: str, velocity_rad_s: AzEl) -> None:
-        """No motor that is beyond the travel, by the drive's count, is driven farther out."""
+        """No motor that is beyond the travel, by the drive's count, is driven farther out.
+
+        One that was sent back and is then held may turn round, and return no farther than it was.
+        """
         if self._lines[f"{name} siderostat"].was_wrong("encoder", STUCK_S):
             return
-        most_rad = self._travel_rad[name] + self._coasts_rad[name]
+        travel_rad, farthest_rad = self._travel_rad[name], self._farthest_rad[name]
         hardly_rad_s = _HARDLY * self._most_rad_s[name]
         motors_rad = self._plant.loops[name].state.motor_rad[0].tolist()
         zeros_rad = self._amplifiers[name].zero_rad
-        for motor_rad, zero_rad, rad_s in zip(motors_rad, zeros_rad, velocity_rad_s, strict=True):
-            position_rad = motor_rad - zero_rad
-            if (
-                abs(position_rad) > most_rad
-                and math.copysign(rad_s, position_rad * rad_s) > hardly_rad_s
-            ):
+        turned_rad = self._turned_rad[name]
+        for axis, rad_s in enumerate(velocity_rad_s):
+            position_rad = motors_rad[axis] - zeros_rad[axis]
+            away_rad, outward_rad_s = abs(position_rad), math.copysign(rad_s, position_rad * rad_s)
+            if away_rad <= travel_rad:
+                turned_rad[axis] = farthest_rad
+            elif outward_rad_s < -hardly_rad_s:
+                turned_rad[axis] = max(turned_rad[axis], away_rad)
+            elif outward_rad_s > hardly_rad_s and away_rad > turned_rad[axis]:
                 self._violated(
                     "no siderostat is driven beyond its travel",
-                    f"{name}: {rad_s:.2f} rad/s at {position_rad:.2f} rad, at most {most_rad:.2f} rad",
+                    f"{name}: {rad_s:.2f} rad/s at {position_rad:.2f} rad, "
+                    f"at most {turned_rad[axis]:.2f} rad",
                 )
 
     def stands(self, name: str, loop: Loop, now_s: float) -> None:

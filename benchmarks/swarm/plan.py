@@ -72,6 +72,10 @@ _SLEW_S = 1.5  # a slew is interrupted within this time of its beginning,
 _MEETS_S = 0.1  # and a stall follows within this
 _WRONG = 0.25  # fraction of strikes with wrong values, on devices that can have some
 _AT_TIMES, _LASTS_LONGER = 0.3, 5.0  # fraction of faults that meet only some calls, and last longer
+_BOOTS, _BOOT_S = (
+    0.5,
+    (-1.0, 1.0),
+)  # fraction of restarts that take time, and powers of ten of how long
 _ONCE, _LAST_CALL = 0.3, 40  # fraction of these that meet a single call, one of the next so many
 _WRONG_RAD = -1.5, 0.7  # powers of ten of what an encoder is wrong by
 _AT_ONCE_S = 0.004  # mean delay between hurried commands
@@ -297,7 +301,7 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
             while command is not None and random.random() < repeated:
                 again_s += random.expovariate(1 / _REPEATED_S)
                 happenings.append(Order(at_s=again_s, who=who, command=command))
-    settings = drawn_settings(random, rig, fast=fast)
+    settings = drawn_settings(random, rig, duration_s, fast=fast)
     if random.random() < _LEARNER:
         happenings += _learner(random, duration_s, stars_of(rig))
         settings += learning(rig) if random.random() < _LEARNS else []
@@ -385,7 +389,7 @@ def _strike(random: Random, at_s: float, devices: list[str], faults: list[str]) 
     at_times = fault in OF_SOME_CALLS and random.random() < _AT_TIMES
     once = at_times and random.random() < _ONCE
     lasts_s = 10 ** random.uniform(-2.0, 1.0)
-    return [
+    struck: list[Happening] = [
         Strike(
             at_s=at_s,
             device=device,
@@ -396,6 +400,17 @@ def _strike(random: Random, at_s: float, devices: list[str], faults: list[str]) 
             number=random.randint(1, _LAST_CALL) if once else 0,
         )
     ]
+    if (
+        fault in {"reset", "power cut"} and random.random() < _BOOTS
+    ):  # and cannot be reached meanwhile
+        boot = Strike(
+            at_s=at_s,
+            device=device,
+            fault=random.choice(("unplugged", "deaf")),
+            lasts_s=10 ** random.uniform(*_BOOT_S),
+        )
+        struck.append(boot)
+    return struck
 
 
 def _drawn_size(random: Random, device: str, fault: str) -> float:

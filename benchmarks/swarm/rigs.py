@@ -40,6 +40,7 @@ FAST = {"fit-mock.toml": 0.1}
 _SEVERAL_WRITES = 0.15  # fraction of runs whose mirrors are written between frames
 # Fraction of runs with each change of the sky, and of those that the rig file knows.
 _SKY, _TOLD = 0.15, 0.5
+_GUST_S = 6.0  # before a gust there is calm for so long, and it is shorter
 PHOTON_NOISE = "camera.electrons_per_dn=1.0"
 
 
@@ -71,13 +72,34 @@ def learning(rig: str) -> list[str]:
     return [f'loops.{loop}.learn="on"' for loop in stars_of(rig)]
 
 
-def vibrating(rig: str, frequency_hz: float, rms_px: float, direction_deg: float) -> list[str]:
-    """Settings with a vibration in the motion of a rig's stars."""
-    line = (
+def vibration(frequency_hz: float, rms_px: float, direction_deg: float) -> str:
+    """A vibration in the motion of a star, as the rig file has it."""
+    return (
         f"{{frequency_hz={frequency_hz:.2f}, rms_px={rms_px:.3f}, direction_deg={direction_deg:.1f}, "
         "damping=0.01, drift_hz_per_min=0.0}"
     )
-    return [f"plant.loops.{loop}.lines=[{line}]" for loop in stars_of(rig)]
+
+
+def drawn_vibration(random: Random, hz: tuple[float, float], rms_px: tuple[float, float]) -> str:
+    """A vibration in any direction."""
+    return vibration(random.uniform(*hz), random.uniform(*rms_px), random.uniform(0.0, 180.0))
+
+
+def vibrating(rig: str, lines: str) -> list[str]:
+    """Settings with a vibration in the motion of a rig's stars."""
+    return [f"plant.loops.{loop}.lines=[{lines}]" for loop in stars_of(rig)]
+
+
+def gusty(rig: str, gusts: list[tuple[float, float, str]], lines: str = "") -> list[str]:
+    """Settings with gusts: from when to when the stars have which vibration instead of `lines`."""
+    times = [
+        change for begin_s, end_s, gust in gusts for change in ((begin_s, gust), (end_s, lines))
+    ]
+    changes = []
+    for at_s, which in times:
+        loops = ", ".join(f"{loop}={{lines=[{which}]}}" for loop in stars_of(rig))
+        changes.append(f"{{at_s={at_s:.2f}, loops={{{loops}}}}}")
+    return [f"plant.timeline=[{', '.join(changes)}]"]
 
 
 def moving(rig: str, az_arcsec_s: float, el_arcsec_s: float, *, told: bool) -> list[str]:
@@ -112,13 +134,15 @@ def with_another_spot(rig: str, *, told: bool) -> list[str]:
     return [f"plant.loops.{loop}.spots=[{true}]", *([known] if told else [])]
 
 
-def drawn_sky(random: Random, rig: str) -> list[str]:
+def drawn_sky(random: Random, rig: str, duration_s: float) -> list[str]:
     """Settings of the light and of the stars, most often none."""
     settings = [PHOTON_NOISE] if random.random() < _SKY else []
+    lines = ""
     if random.random() < _SKY:
-        settings += vibrating(
-            rig, random.uniform(1.0, 20.0), random.uniform(0.02, 0.3), random.uniform(0.0, 180.0)
-        )
+        lines = drawn_vibration(random, (1.0, 20.0), (0.02, 0.3))
+        settings += vibrating(rig, lines)
+    if random.random() < _SKY:
+        settings += gusty(rig, drawn_gusts(random, duration_s), lines)
     if random.random() < _SKY:
         told = random.random() < _TOLD
         # Without being told, Eq. 20 has the mirror at its limit from 0.3 arcsec/s on.
@@ -130,6 +154,15 @@ def drawn_sky(random: Random, rig: str) -> list[str]:
     return settings
 
 
+def drawn_gusts(random: Random, duration_s: float) -> list[tuple[float, float, str]]:
+    """From when to when each lasts, and its vibration, which brings mirrors to the limit of their range."""
+    gusts, at_s = [], 0.0
+    while (at_s := at_s + random.uniform(_GUST_S, duration_s / 2)) < duration_s - _GUST_S:
+        gust = drawn_vibration(random, (0.5, 5.0), (1.0, 10.0))
+        gusts.append((at_s, at_s + random.uniform(0.2, 0.9 * _GUST_S), gust))
+    return gusts
+
+
 def devices_of(rig: str) -> list[str]:
     """The devices of a rig."""
     devices = ["camera"]
@@ -139,8 +172,8 @@ def devices_of(rig: str) -> list[str]:
     return [*devices, "hexapod"] if "metrology" in RIGS[rig] else devices
 
 
-def drawn_settings(random: Random, rig: str, *, fast: bool) -> list[str]:
-    """What a run changes of its rig; with `fast` frames or without."""
+def drawn_settings(random: Random, rig: str, duration_s: float, *, fast: bool) -> list[str]:
+    """What a run of this duration changes of its rig; with `fast` frames or without."""
     # At the rig's own rate, telemetry takes a tenth of the run's time.
     settings = ["supervisor.telemetry_hz=5.0"]
     settings += [text for text in SETTINGS if random.random() < _SETTING]
@@ -150,4 +183,4 @@ def drawn_settings(random: Random, rig: str, *, fast: bool) -> list[str]:
         settings += slow_servos(rig, random.randrange(2))
     if not fast and random.random() < _SEVERAL_WRITES:
         settings += several_writes(rig)
-    return settings + drawn_sky(random, rig)
+    return settings + drawn_sky(random, rig, duration_s)

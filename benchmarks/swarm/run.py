@@ -97,7 +97,10 @@ _SAVED_S = 1.0  # so often a supervisor leaves where its stars are
 _MISLED_S = 10.0  # after a repeated image or a wrong encoder, in which a star's place may be wrong
 _BACK_S = 15.0  # after a kill or a shutdown, and what was waited for when all was healed
 _STAY_S = 5.0  # for so long a star that is held must stay so
-_STAYS_PX = 0.5  # mean over a second
+_STAYS_PX = 0.5  # mean over a second, and
+_RMS_PX = (
+    0.06  # about it, of a star that does not vibrate: more than twice the most that was measured
+)
 _LEADS_ON: dict[Mode, type[Standby | Recover | Acquire]] = {
     Mode.OFF: Standby,
     Mode.SAFE: Recover,
@@ -664,11 +667,15 @@ def _stay(instrument: Instrument) -> None:
     for name, loop in instrument.supervisor.loops.items():
         if loop.mode not in HOLDING:
             violated("a star that is held stays so", f"{name}: {loop.mode.name}")
+    truth, _ = instrument.rig.mock_parts()
     for name, star in instrument.supervisor.stellar_loops.items():
         seen_px = instrument.plant.stellar_loops[name].history_px(time.now_s() - 1.0, time.now_s())
         away_px = np.abs(seen_px[:, 0, 0].mean(axis=0) - star.target_px).max()
         if star.mode in HOLDING and not away_px <= _STAYS_PX:
             violated("a star that is held stays so", f"{name}: {away_px:.2f} px from its target")
+        rms_px = seen_px[:, 0, 0].std(axis=0).max()
+        if star.mode in HOLDING and not (truth.stellar_loops[name].lines or rms_px <= _RMS_PX):
+            violated("a star that is held stays so", f"{name}: {rms_px:.3f} px RMS")
 
 
 def _recover(instrument: Instrument) -> None:

@@ -239,6 +239,23 @@ def test_no_motor_that_is_beyond_its_travel_is_driven_farther(
     assert watched.go_on(0.1) == violated
 
 
+def test_a_motor_beyond_its_travel_may_return_to_where_it_was_sent_back_from_and_no_farther():
+    watched = Rig()
+    motor_rad = watched.plant.loops["right"].state.motor_rad[0]
+    send = watched.invariants.motion.velocity
+    motor_rad[:] = 0.0, 82.0
+    for rad_s in np.linspace(0.0, -5.0, 11):
+        send("right", (0.0, rad_s))
+    motor_rad[:] = 0.0, 81.0
+    for rad_s in np.linspace(-5.0, 5.0, 21):  # a release: it is held where it was
+        send("right", (0.0, rad_s))
+    assert watched.go_on(0.1) == []
+
+    motor_rad[:] = 0.0, 82.5
+    send("right", (0.0, 5.0))
+    assert watched.go_on(0.1) == ["no siderostat is driven beyond its travel"]
+
+
 def test_a_velocity_changes_no_faster_than_a_motor_may_accelerate_but_for_a_stop():
     watched = Rig()
     siderostat = watched.rig.loops["right"].siderostat

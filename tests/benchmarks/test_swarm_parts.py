@@ -1,5 +1,6 @@
 """What the swarm has beside the supervisor: recorder, service, console, sequences, and their invariants."""
 
+import itertools
 from functools import partial
 from random import Random
 from typing import get_args
@@ -62,6 +63,7 @@ from fitctl.model.plant import Plant
 from fitctl.sequences.contact import Contact
 from fitctl.sequences.steps import AnyStep
 from fitctl.service.admission import Admission
+from fitctl.stages.mirror import MirrorStage
 from fitctl.stages.servo import SiderostatServo
 from fitctl.stages.siderostat import SiderostatStage
 from fitctl.tui.state import ConsoleState
@@ -616,6 +618,20 @@ def test_a_stage_that_moves_by_a_zero_that_is_lost_is_a_violation(monkeypatch):
     violated = {one.invariant for one in run_plan(on_analogue).violations}
 
     assert "no stage moves by a zero that is lost" in violated
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("jump_urad", [0.0, 3.0])
+def test_a_mirror_that_jumps_to_and_fro_while_a_star_is_held_is_a_violation(monkeypatch, jump_urad):
+    move_to, jumps_rad = MirrorStage.move_to, itertools.cycle([jump_urad * 1e-6, -jump_urad * 1e-6])
+
+    def jump(self, mirror_rad, **options):
+        move_to(self, mirror_rad + next(jumps_rad), **options)
+
+    monkeypatch.setattr(MirrorStage, "move_to", jump)
+    violated = {one.invariant for one in run_plan(plan(gives(0.1, Standby()))).violations}
+
+    assert violated == ({"a star that is held stays so"} if jump_urad else set())
 
 
 # ------------------------------------------------------------ defects of the past, each from a plan of its own

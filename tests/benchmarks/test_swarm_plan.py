@@ -7,18 +7,21 @@ import pytest
 
 from benchmarks.swarm.commands import LEARNT_DESIGNS
 from benchmarks.swarm.lines import FAULTS, WRONG
-from benchmarks.swarm.plan import Happening, Order, Strike, drawn_plan, kind_of
+from benchmarks.swarm.plan import DURATION_S, Happening, Order, Strike, drawn_plan, kind_of
 from benchmarks.swarm.rigs import (
     PHOTON_NOISE,
     RIGS,
     SETTINGS,
     SLOW,
     devices_of,
+    drawn_gusts,
+    gusty,
     learning,
     moving,
     several_writes,
     slow_servos,
     vibrating,
+    vibration,
     with_another_spot,
 )
 from benchmarks.swarm.run import RIGS as FOLDER
@@ -26,6 +29,7 @@ from fitctl.config import ConfigError, load_rig
 from fitctl.controllers.design.choose import design_for
 from fitctl.messages.commands import AnyCommand, RecorderReport, SequenceReport
 
+VIBRATION = vibration(20.0, 0.3, 180.0)
 KINDS = {kind_of(device) for device in devices_of("fit-testbed.toml")}
 
 
@@ -36,7 +40,8 @@ def test_every_setting_is_one_that_the_rig_can_have(rig):
         load_rig(FOLDER / rig, [*SETTINGS, *slow_servos(rig, which)])
     for told in (False, True):
         skies = [
-            *vibrating(rig, 20.0, 0.3, 180.0),
+            *vibrating(rig, VIBRATION),
+            *gusty(rig, drawn_gusts(Random(1), DURATION_S), VIBRATION),
             *moving(rig, 0.3, -0.3, told=told),
             *with_another_spot(rig, told=told),
         ]
@@ -56,6 +61,34 @@ def test_a_setting_of_the_sky_is_true_of_each_star_and_known_if_it_is_told():
     ]
     assert known[0] == [None, None]
     assert [(rate.az, rate.el) for rate in known[1]] == [(0.2, -0.1)] * 2
+
+
+def test_after_each_gust_the_stars_vibrate_as_before_and_all_are_over_when_the_healing_begins():
+    rig = "two-stars.toml"
+    for seed in range(50):
+        gusts = drawn_gusts(Random(seed), DURATION_S)
+        plant = load_rig(
+            FOLDER / rig, [*vibrating(rig, VIBRATION), *gusty(rig, gusts, VIBRATION)]
+        ).plant
+
+        for loop in ("right", "left"):
+            changes = plant.changes(loop)
+            before = plant.stellar_loops[loop].lines
+            assert [change.lines == before for _, change in changes] == [False, True] * len(gusts)
+            assert changes[-1][0] < DURATION_S
+
+
+def test_restarts_take_no_time_or_some_in_which_the_device_does_not_answer():
+    takes = set()
+    for seed in range(50):
+        happenings = drawn_plan(Random(seed), seed, "fit-testbed.toml").happenings
+        struck = [happening for happening in happenings if isinstance(happening, Strike)]
+        for restart in struck:
+            if restart.fault in {"reset", "power cut"}:
+                others = [other for other in struck if other.at_s == restart.at_s]
+                booting = {other.fault for other in others if other.device == restart.device}
+                takes |= booting - {restart.fault} or {""}
+    assert takes >= {"", "unplugged", "deaf"}
 
 
 def test_plans_have_every_kind_of_happening():
