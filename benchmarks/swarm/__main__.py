@@ -36,6 +36,7 @@ _RUNS_A_SEED = 1_000_000
 _MET_S = 1.0
 _SHOWN = 10
 _MOST_TRIALS = 100  # runs in which the plan of a violation is shrunk
+_ENDING = threading.Event()  # a signal came; each process of the swarm has its own
 _DIED = "a process of the swarm died in one of these seeds: "
 
 
@@ -67,7 +68,7 @@ def run_and_shrink(seed: int) -> Run:
         return run
     first = violations[0]
     print(f"\n{seed} violates: {first.invariant}; it is being shrunk", file=sys.stderr, flush=True)
-    return run._replace(shrunk=shrunk_from(run.plan, first, _MOST_TRIALS))
+    return run._replace(shrunk=shrunk_from(run.plan, first, _MOST_TRIALS, _ENDING.is_set))
 
 
 def met(plan: Plan) -> Iterator[tuple[str, str]]:
@@ -146,20 +147,19 @@ class Totals:
 def swarm(seed: int, hours: float, jobs: int) -> dict[str, Any]:
     """Run until so many hours are simulated, a thing was violated in ten runs, or somebody presses Ctrl-C.
 
-    Runs that have begun then are finished and counted: one that is being shrunk takes longer than the others,
-    and its violation must not be lost. The swarm also ends if a process of the pool dies.
+    Runs that have begun then are finished and counted; a plan that is being shrunk after Ctrl-C stays as long
+    as it then is. The swarm also ends if a process of the pool dies.
     """
     totals = Totals()
     seeds = (seed * _RUNS_A_SEED + number for number in count())
-    ending = threading.Event()
     running: dict[Future[Run], int] = {}
     # Its processes inherit the handler, and finish their runs.
-    with ended_by_signals(ending.set), ProcessPoolExecutor(jobs) as pool:
+    with ended_by_signals(_ENDING.set), ProcessPoolExecutor(jobs) as pool:
         try:
             while (
                 totals.simulated_s < 3600 * hours
                 and len(totals.found) < _SHOWN
-                and not ending.is_set()
+                and not _ENDING.is_set()
             ):
                 while len(running) < 2 * jobs:
                     begun = next(seeds)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import msgspec
 
@@ -24,9 +25,17 @@ def shrunk(plan: Plan, most_runs: float = math.inf) -> Plan:
     return shrunk_from(plan, violations[0], most_runs) if violations else plan
 
 
-def shrunk_from(plan: Plan, violation: Violation, most_runs: float = math.inf) -> Plan:
-    """As :func:`shrunk`, for a plan whose first violation is known."""
+def shrunk_from(
+    plan: Plan,
+    violation: Violation,
+    most_runs: float = math.inf,
+    is_over: Callable[[], bool] = lambda: False,
+) -> Plan:
+    """As :func:`shrunk`, for a plan whose first violation is known, and only until `is_over`."""
     runs = 0
+
+    def is_enough() -> bool:
+        return runs >= most_runs or is_over()
 
     def violates(happenings: list[Happening]) -> bool:
         nonlocal runs
@@ -37,12 +46,12 @@ def shrunk_from(plan: Plan, violation: Violation, most_runs: float = math.inf) -
     happenings, parts, begin = list(plan.happenings), 2, 0
     # Most of what comes after the violation cannot have caused it.
     before = [happening for happening in happenings if happening.at_s <= violation.at_s]
-    if 0 < len(before) < len(happenings) and most_runs > 0 and violates(before):
+    if 0 < len(before) < len(happenings) and not is_enough() and violates(before):
         happenings = before
-    while len(happenings) > 1 and runs < most_runs:
+    while len(happenings) > 1 and not is_enough():
         size = -(-len(happenings) // parts)
         for start in range(begin, len(happenings), size):
-            if runs >= most_runs:
+            if is_enough():
                 break
             fewer = happenings[:start] + happenings[start + size :]
             if violates(fewer):

@@ -14,7 +14,7 @@ from benchmarks.swarm.__main__ import finding, met, run_and_shrink, run_seed
 from benchmarks.swarm.past import put_back
 from benchmarks.swarm.plan import Order, Plan, Strike, plan_of
 from benchmarks.swarm.run import run_plan
-from benchmarks.swarm.shrink import shrunk
+from benchmarks.swarm.shrink import shrunk, shrunk_from
 from benchmarks.swarm.threads import (
     VirtualEvent,
     VirtualExecutor,
@@ -74,30 +74,43 @@ def test_a_defect_of_the_past_that_is_put_back_is_found():
     assert run_plan(OVERTAKEN).violations == []
 
 
+IDLE = [Order(at_s=0.01 * number, who="ada", command=Release()) for number in range(6, 9)]
+LONGER = msgspec.structs.replace(OVERTAKEN, happenings=[*IDLE, *OVERTAKEN.happenings])
+
+
 @pytest.mark.long
 def test_a_plan_is_shrunk_to_what_violates():
-    idle = [Order(at_s=0.01 * number, who="ada", command=Release()) for number in range(6, 9)]
-    plan = msgspec.structs.replace(OVERTAKEN, happenings=[*idle, *OVERTAKEN.happenings])
-
     with put_back("stop-while-opening"):
-        assert shrunk(plan).happenings == OVERTAKEN.happenings
+        assert shrunk(LONGER).happenings == OVERTAKEN.happenings
 
 
-@pytest.mark.long
-def test_shrinking_ends_after_so_many_runs(monkeypatch):
-    runs = []
+@pytest.fixture
+def trials(monkeypatch):
+    """The plans that are run from here on to shrink one."""
+    tried = []
 
     def counted(plan):
-        runs.append(plan)
+        tried.append(plan)
         return run_plan(plan)
 
     monkeypatch.setattr("benchmarks.swarm.shrink.run_plan", counted)
-    idle = [Order(at_s=0.01 * number, who="ada", command=Release()) for number in range(6, 9)]
-    plan = msgspec.structs.replace(OVERTAKEN, happenings=[*idle, *OVERTAKEN.happenings])
-    with put_back("stop-while-opening"):
-        shrunk(plan, most_runs=2)
+    return tried
 
-    assert len(runs) == 1 + 2  # the first finds the violation
+
+@pytest.mark.long
+def test_shrinking_ends_after_so_many_runs(trials):
+    with put_back("stop-while-opening"):
+        shrunk(LONGER, most_runs=2)
+
+    assert len(trials) == 1 + 2  # the first finds the violation
+
+
+@pytest.mark.long
+def test_shrinking_ends_with_the_run_that_is_under_way_when_a_signal_comes(trials):
+    with put_back("stop-while-opening"):
+        shrunk_from(LONGER, run_plan(LONGER).violations[0], is_over=lambda: len(trials) == 1)
+
+    assert len(trials) == 1
 
 
 @pytest.mark.long
