@@ -23,12 +23,12 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from benchmarks.swarm.drivers import NIGHTS
 from benchmarks.swarm.invariants import NO_EXCEPTION
 from benchmarks.swarm.past import DEFECTS, put_back
 from benchmarks.swarm.plan import Plan, plan_of
 from benchmarks.swarm.run import Result, failed_run, run_plan
 from benchmarks.swarm.shrink import shrunk, shrunk_from
+from benchmarks.swarm.wires.drivers import NIGHTS
 from fitctl.logging.records import AnyRecord, Event
 from fitctl.processes import ended_by_signals
 

@@ -13,11 +13,9 @@ from benchmarks.swarm.devices.amplifiers import SwarmAmplifiers
 from benchmarks.swarm.lines import Line
 from fitctl.clock import Clock
 from fitctl.config import Rig
-from fitctl.config.base import ARCSEC_PER_RAD
 from fitctl.drivers.interface import AzEl, Pose
 from fitctl.loop.loop import Loop
 from fitctl.messages.modes import Mode
-from fitctl.model.optics import motor_sky_rad_per_rad
 from fitctl.model.plant import Plant
 from fitctl.supervisor.supervisor import Supervisor
 
@@ -100,10 +98,9 @@ class Motion:
         self._turned_rad: dict[str, list[float]] = {}  # by loop: beyond its travel, how far it was
         for name, loop in rig.loops.items():
             siderostat = loop.siderostat
-            sky_arcsec_per_rad = motor_sky_rad_per_rad(siderostat) * ARCSEC_PER_RAD
-            self._travel_rad[name] = travel_rad = siderostat.travel_sky_arcsec / sky_arcsec_per_rad
             # A servo acts on readings of up to this age, and its command takes up to three periods to arrive.
             unseen_s = self._three_periods_s[name] + 1 / siderostat.servo.gain_per_s
+            self._travel_rad[name] = travel_rad = siderostat.travel_rad
             self._farthest_rad[name] = travel_rad + siderostat.velocity_limit_rad_s * unseen_s
             self._turned_rad[name] = [self._farthest_rad[name]] * 2
             crossing_s = 2 * travel_rad / siderostat.velocity_limit_rad_s
@@ -163,7 +160,7 @@ class Motion:
         """
         if self._lines[f"{name} siderostat"].was_wrong("encoder", STUCK_S):
             return
-        travel_rad, farthest_rad = self._travel_rad[name], self._farthest_rad[name]
+        travel_rad = self._travel_rad[name]
         hardly_rad_s = _HARDLY * self._most_rad_s[name]
         motors_rad = self._plant.loops[name].state.motor_rad[0].tolist()
         zeros_rad = self._amplifiers[name].zero_rad
@@ -172,7 +169,7 @@ class Motion:
             position_rad = motors_rad[axis] - zeros_rad[axis]
             away_rad, outward_rad_s = abs(position_rad), math.copysign(rad_s, position_rad * rad_s)
             if away_rad <= travel_rad:
-                turned_rad[axis] = farthest_rad
+                turned_rad[axis] = self._farthest_rad[name]
             elif outward_rad_s < -hardly_rad_s:
                 turned_rad[axis] = max(turned_rad[axis], away_rad)
             elif outward_rad_s > hardly_rad_s and away_rad > turned_rad[axis]:

@@ -72,10 +72,8 @@ _SLEW_S = 1.5  # a slew is interrupted within this time of its beginning,
 _MEETS_S = 0.1  # and a stall follows within this
 _WRONG = 0.25  # fraction of strikes with wrong values, on devices that can have some
 _AT_TIMES, _LASTS_LONGER = 0.3, 5.0  # fraction of faults that meet only some calls, and last longer
-_BOOTS, _BOOT_S = (
-    0.5,
-    (-1.0, 1.0),
-)  # fraction of restarts that take time, and powers of ten of how long
+_BOOTS = 0.5  # fraction of restarts that take time,
+_BOOT_S = -1.0, 1.0  # powers of ten of how long
 _ONCE, _LAST_CALL = 0.3, 40  # fraction of these that meet a single call, one of the next so many
 _WRONG_RAD = -1.5, 0.7  # powers of ten of what an encoder is wrong by
 _AT_ONCE_S = 0.004  # mean delay between hurried commands
@@ -92,7 +90,8 @@ _REFERENCED_S = 7.0  # until a reference move has ended
 _BURST, _BURST_S = 0.4, 0.05  # fraction of happenings that follow another at once, and mean delay
 
 
-AT_ONCE = frozenset({"reset", "power cut", "trip"})
+RESTARTS = ("reset", "power cut")
+AT_ONCE = frozenset({*RESTARTS, "trip"})
 """Faults without a duration. A drive that has tripped stays so until it is opened again."""
 
 
@@ -327,7 +326,7 @@ def _drawn_strikes(random: Random, rig: str) -> list[Callable[[Random, float], l
     Each makes the happenings that begin at a time. One that is there twice comes twice as often.
     """
     loops, devices = RIGS[rig], devices_of(rig)
-    kinds = ("reset", "power cut", *FAULTS)
+    kinds = (*RESTARTS, *FAULTS)
     faults = random.sample(kinds, random.randint(1, len(kinds)))
     struck = random.sample(devices, random.randint(1, len(devices)))
     strikes: list[Callable[[Random, float], list[Happening]]] = []
@@ -400,9 +399,7 @@ def _strike(random: Random, at_s: float, devices: list[str], faults: list[str]) 
             number=random.randint(1, _LAST_CALL) if once else 0,
         )
     ]
-    if (
-        fault in {"reset", "power cut"} and random.random() < _BOOTS
-    ):  # and cannot be reached meanwhile
+    if fault in RESTARTS and random.random() < _BOOTS:
         boot = Strike(
             at_s=at_s,
             device=device,

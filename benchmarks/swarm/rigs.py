@@ -90,7 +90,7 @@ def vibrating(rig: str, lines: str) -> list[str]:
     return [f"plant.loops.{loop}.lines=[{lines}]" for loop in stars_of(rig)]
 
 
-def gusty(rig: str, gusts: list[tuple[float, float, str]], lines: str = "") -> list[str]:
+def gusty(rig: str, gusts: list[tuple[float, float, str]], lines: str) -> list[str]:
     """Settings with gusts: from when to when the stars have which vibration instead of `lines`."""
     times = [
         change for begin_s, end_s, gust in gusts for change in ((begin_s, gust), (end_s, lines))

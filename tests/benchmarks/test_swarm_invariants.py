@@ -9,12 +9,12 @@ from samples.learner_reports import report
 
 from benchmarks.swarm.commands import LEARNT_DESIGNS
 from benchmarks.swarm.devices.hexapod import SwarmHexapod
+from benchmarks.swarm.instrument import RIGS as FOLDER
 from benchmarks.swarm.invariants import NO_EXCEPTION, Invariants
 from benchmarks.swarm.lines import FAULTS, WRONG, Line
 from benchmarks.swarm.past import put_back
 from benchmarks.swarm.plan import Order, Plan, Strike
 from benchmarks.swarm.rigs import devices_of
-from benchmarks.swarm.run import RIGS as FOLDER
 from benchmarks.swarm.run import run_plan
 from benchmarks.swarm.threads import VirtualTime
 from fitctl.config import load_rig

@@ -6,8 +6,17 @@ from typing import get_args
 import pytest
 
 from benchmarks.swarm.commands import LEARNT_DESIGNS
+from benchmarks.swarm.instrument import RIGS as FOLDER
 from benchmarks.swarm.lines import FAULTS, WRONG
-from benchmarks.swarm.plan import DURATION_S, Happening, Order, Strike, drawn_plan, kind_of
+from benchmarks.swarm.plan import (
+    DURATION_S,
+    RESTARTS,
+    Happening,
+    Order,
+    Strike,
+    drawn_plan,
+    kind_of,
+)
 from benchmarks.swarm.rigs import (
     PHOTON_NOISE,
     RIGS,
@@ -24,7 +33,6 @@ from benchmarks.swarm.rigs import (
     vibration,
     with_another_spot,
 )
-from benchmarks.swarm.run import RIGS as FOLDER
 from fitctl.config import ConfigError, load_rig
 from fitctl.controllers.design.choose import design_for
 from fitctl.messages.commands import AnyCommand, RecorderReport, SequenceReport
@@ -84,7 +92,7 @@ def test_restarts_take_no_time_or_some_in_which_the_device_does_not_answer():
         happenings = drawn_plan(Random(seed), seed, "fit-testbed.toml").happenings
         struck = [happening for happening in happenings if isinstance(happening, Strike)]
         for restart in struck:
-            if restart.fault in {"reset", "power cut"}:
+            if restart.fault in RESTARTS:
                 others = [other for other in struck if other.at_s == restart.at_s]
                 booting = {other.fault for other in others if other.device == restart.device}
                 takes |= booting - {restart.fault} or {""}

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from benchmarks.swarm.bench import Mistaken
-from benchmarks.swarm.camera_bench import run_camera
-from benchmarks.swarm.camera_wire import KINDS as CAMERA_KINDS
-from benchmarks.swarm.camera_wire import RARE_KINDS
-from benchmarks.swarm.drivers import BENCHES, NIGHTS, run_wire
-from benchmarks.swarm.wires import KINDS, Trouble
+from benchmarks.swarm.wires.bench import Mistaken
+from benchmarks.swarm.wires.camera_bench import run_camera
+from benchmarks.swarm.wires.camera_wire import KINDS as CAMERA_KINDS
+from benchmarks.swarm.wires.camera_wire import RARE_KINDS
+from benchmarks.swarm.wires.drivers import BENCHES, NIGHTS, run_wire
+from benchmarks.swarm.wires.wire import KINDS, Trouble
 from fitctl.drivers.c887.link import C887Link
 from fitctl.drivers.cia402.node import Node
 from fitctl.drivers.endpoint import Endpoint

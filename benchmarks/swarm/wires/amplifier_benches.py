@@ -9,8 +9,8 @@ from typing import Any
 
 import can
 
-from benchmarks.swarm.bench import SLACK_S, Bench, Course, Mistaken, Modbus, rig_of
-from benchmarks.swarm.wires import Trouble, WireTime
+from benchmarks.swarm.wires.bench import SLACK_S, Bench, Course, Mistaken, Modbus, rig_of
+from benchmarks.swarm.wires.wire import Trouble, WireTime
 from fitctl.drivers.bal_analog.driver import BalAnalogAmplifiers
 from fitctl.drivers.cia402.driver import Cia402Amplifiers
 from fitctl.drivers.ensemble.driver import EnsembleAmplifiers

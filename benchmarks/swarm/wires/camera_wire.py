@@ -30,7 +30,7 @@ from benchmarks.swarm.threads import (
     VirtualTime,
     standing_for,
 )
-from benchmarks.swarm.wires import Timer, Trouble
+from benchmarks.swarm.wires.wire import Timer, Trouble
 from fitctl.drivers.gige import protocol
 from fitctl.drivers.gige.protocol import Command
 

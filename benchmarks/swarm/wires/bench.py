@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from benchmarks.swarm.wires import Trouble, Wire, WireTime
+from benchmarks.swarm.wires.wire import Trouble, Wire, WireTime
 from fitctl.config import Rig, default_rig_path, load_rig
 from fitctl.mocks.modbus.tcp import ModbusTcpServer, pop_message
 

@@ -17,10 +17,10 @@ import numpy as np
 from greenlet import getcurrent
 from numpy.typing import NDArray
 
-from benchmarks.swarm.bench import PAUSES_S, Mistaken, rig_of
-from benchmarks.swarm.camera_wire import CAMERA, KINDS, RARE_KINDS, Address, Network, on
 from benchmarks.swarm.threads import VirtualTime
-from benchmarks.swarm.wires import Trouble
+from benchmarks.swarm.wires.bench import PAUSES_S, Mistaken, rig_of
+from benchmarks.swarm.wires.camera_wire import CAMERA, KINDS, RARE_KINDS, Address, Network, on
+from benchmarks.swarm.wires.wire import Trouble
 from fitctl.drivers.gige import protocol
 from fitctl.drivers.gige.driver import GigeCamera
 from fitctl.drivers.gige.gvcp import ATTEMPTS, ControlChannel

@@ -18,15 +18,15 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.swarm.amplifier_benches import (
+from benchmarks.swarm.wires.amplifier_benches import (
     BalAnalogBench,
     Cia402Bench,
     EnsembleBench,
     SlcanBench,
 )
-from benchmarks.swarm.bench import PAUSES_S, Bench, Course, Mistaken, Modbus, rig_of
-from benchmarks.swarm.camera_bench import drawn_camera_run, run_camera
-from benchmarks.swarm.wires import KINDS, Trouble, Wire, WireTime, virtual
+from benchmarks.swarm.wires.bench import PAUSES_S, Bench, Course, Mistaken, Modbus, rig_of
+from benchmarks.swarm.wires.camera_bench import drawn_camera_run, run_camera
+from benchmarks.swarm.wires.wire import KINDS, Trouble, Wire, WireTime, virtual
 from fitctl.config import Rig
 from fitctl.drivers.c887.driver import C887Hexapod
 from fitctl.drivers.interface import DeviceError, Pose

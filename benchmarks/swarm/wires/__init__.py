@@ -1,0 +1,1 @@
+"""Drivers and their mocks on virtual time, with a bad wire between them."""

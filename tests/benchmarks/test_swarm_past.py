@@ -1,0 +1,175 @@
+"""Defects of the past, put back one at a time: each is found from a plan of a few happenings."""
+
+import pytest
+
+from benchmarks.swarm.past import put_back
+from benchmarks.swarm.plan import Cloud, Kill, Stall, Strike
+from benchmarks.swarm.rigs import slow_servos
+from benchmarks.swarm.run import run_plan
+from fitctl.messages.commands import (
+    Acquire,
+    Experiment,
+    Jog,
+    Off,
+    Recover,
+    Release,
+    SetBiasOffset,
+    SetTarget,
+    Standby,
+    Stop,
+)
+from fitctl.model.drives import standstill
+from tests.benchmarks.plans import gives, plan
+
+FAR = Acquire(expected_az_sky_arcsec=600.0, expected_el_sky_arcsec=0.0)
+BACK = Acquire(expected_az_sky_arcsec=-200.0, expected_el_sky_arcsec=0.0)
+KILLED_S = (40.0, 52.0, 64.0, 76.0)  # late in a search for a star behind a cloud
+FOUND = {
+    "watchdog-step": (
+        plan(
+            gives(0.1, Standby()),
+            gives(1.5, SetBiasOffset(az_urad=100.0, el_urad=0.0)),
+            Stall(at_s=3.0, lasts_s=1.6),
+            gives(6.0, Standby()),
+        ),
+        "the mirror rests no faster than its slew",
+    ),
+    "repeated-off": (
+        plan(
+            gives(0.1, Standby()),
+            gives(1.5, SetBiasOffset(az_urad=100.0, el_urad=0.0)),
+            *[gives(3.0 + 0.001 * number, Off()) for number in range(4)],
+        ),
+        "the mirror rests no faster than its slew",
+    ),
+    "stall-is-stuck": (
+        plan(gives(0.1, Standby()), gives(2.0, FAR), Stall(at_s=2.2, lasts_s=0.15)),
+        "an axis that is not stuck is not called so",
+    ),
+    "late-is-stuck": (
+        plan(
+            gives(0.1, Standby()),
+            gives(2.0, FAR),
+            Strike(at_s=2.2, device="right siderostat", fault="slow", size=80.0, lasts_s=0.18),
+            Stall(at_s=2.2, lasts_s=0.06),
+        ),
+        "an axis that is not stuck is not called so",
+    ),
+    "star-forgotten": (
+        plan(
+            gives(0.1, Standby()),
+            gives(2.0, FAR),
+            Strike(at_s=2.2, device="right siderostat", fault="unplugged", lasts_s=0.3),
+            gives(4.0, Recover()),
+            gives(6.0, Recover()),
+        ),
+        "encoders that count on keep the star's place",
+    ),
+    "unanswered-turn": (
+        plan(
+            gives(0.1, Standby()),
+            gives(2.0, FAR),
+            gives(30.0, Release()),
+            Strike(at_s=31.985, device="right siderostat", fault="mute", lasts_s=0.5),
+            gives(32.0, Acquire()),
+            gives(34.0, Recover()),
+            duration_s=36.0,
+            settings=slow_servos("fit-mock.toml", 1),
+        ),
+        "encoders that count on keep the star's place",
+    ),
+    "slow-turn": (
+        plan(
+            gives(0.1, Standby()),
+            gives(0.5, FAR),
+            Strike(at_s=2.25, device="right siderostat", fault="slow", size=45.0, lasts_s=0.7),
+            gives(4.2, Recover()),
+            rig="ensemble.toml",
+        ),
+        "encoders that count on keep the star's place",
+    ),
+    "turn-is-stuck": (
+        plan(gives(0.1, Standby()), gives(2.0, FAR), gives(2.2, BACK)),
+        "an axis that is not stuck is not called so",
+    ),
+    "killed-in-a-search": (
+        plan(
+            gives(0.1, None),
+            gives(2.0, None),
+            Cloud(at_s=12.0, lasts_s=70.0, part=0.0),
+            *[Kill(at_s=at_s, back_after_s=0.1) for at_s in KILLED_S],
+            *[gives(at_s + later_s, None) for at_s in KILLED_S for later_s in (0.5, 2.0, 3.0)],
+            duration_s=84.0,
+        ),
+        "healed, every star is held within 60 s",
+    ),
+    "link-counts-late": (
+        plan(
+            *[gives(2.0 * number, None) for number in range(6)],
+            Cloud(at_s=14.0, lasts_s=50.0, part=0.0),
+            gives(15.0, Stop(loop="metrology")),  # else its search begins with small rounds
+            *[gives(at_s, None) for at_s in (16.0, 17.0, 18.0)],
+            Kill(at_s=28.0, back_after_s=0.1),
+            duration_s=29.0,
+            rig="fit-testbed.toml",
+        ),
+        "healed, every star is held within 60 s",
+    ),
+    "follows-what-rests": (
+        plan(
+            *[gives(at_s, None) for at_s in (3.2188, 7.986, 10.3929)],
+            # Where the star of the left loop is to rest.
+            gives(16.0128, SetTarget(loop="right", az_px=19.91032, el_px=17.558116)),
+            Strike(at_s=16.67734, device="left siderostat", fault="unplugged", lasts_s=0.08196),
+            Strike(at_s=26.1557, device="left piezo", fault="reset"),
+            gives(26.83926, SetTarget(loop="left", az_px=18.72842, el_px=18.990017)),
+            Strike(at_s=40.27059, device="left siderostat", fault="power cut"),
+            *[gives(at_s, None) for at_s in (50.2119, 50.6525)],
+            Strike(at_s=53.71987, device="left D/A", fault="reset"),
+            duration_s=150.0,
+            rig="two-stars.toml",
+            settings=slow_servos("two-stars.toml", 1),
+        ),
+        "healed, every star is held within 60 s",
+    ),
+    "experiment-waits": (
+        plan(
+            *[gives(2.0 * number, None) for number in range(6)],
+            Strike(at_s=24.0, device="metrology photodiodes", fault="mute", lasts_s=4.0),
+            gives(26.0, Experiment(loop="left", name="rest", drives=standstill(0.5))),
+            duration_s=30.0,
+            rig="fit-testbed.toml",
+        ),
+        "an experiment ends",
+    ),
+    "jog-in-off": (
+        plan(
+            gives(0.1, Standby()),
+            Strike(at_s=1.0, device="right piezo", fault="mute", lasts_s=6.0),
+            gives(
+                3.0, Jog(az_sky_arcsec=60.0, el_sky_arcsec=0.0)
+            ),  # the device thread waits for it
+            gives(3.005, Off()),
+        ),
+        "no stage moves in OFF or SAFE",
+    ),
+    "powered-unread": (
+        plan(gives(0.1, Standby())),
+        "encoders are read before motors have power",
+    ),
+    "oldest-frame": (
+        plan(gives(0.1, Standby()), Stall(at_s=3.0, lasts_s=0.3)),
+        "a tick acts on the newest frame",
+    ),
+}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("defect", FOUND)
+def test_a_defect_of_the_past_is_found_from_a_plan(defect):
+    found_from, invariant = FOUND[defect]
+    with put_back(defect):
+        violated = {one.invariant for one in run_plan(found_from).violations}
+
+    assert invariant in violated
+    assert run_plan(found_from).violations == []
