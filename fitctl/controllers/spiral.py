@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from fitctl.config import ARCSEC_PER_RAD, HALF_WINDOW_PX, Rig
 from fitctl.controllers.photodiodes import capture_radius_m
 from fitctl.model.compiled import compilable
-from fitctl.model.optics import motor_sky_rad_per_rad, scales, sky_px_per_rad
+from fitctl.model.optics import scales, sky_px_per_rad
 
 _LOOKS_BEYOND_FOUND = 2  # frames in the chord beyond those that count a star as found
 
@@ -108,7 +108,7 @@ def plan_beam_spiral(
     loop = rig.metrology_loops[loop_name]
     acquisition, sensor = loop.acquisition, loop.sensor
     px_per_rad = sky_px_per_rad(rig)
-    px_per_motor_rad = px_per_rad * motor_sky_rad_per_rad(loop.siderostat)
+    px_per_motor_rad = px_per_rad * loop.siderostat.sky_rad_per_motor_rad
     captured_m = capture_radius_m(sensor, acquisition.detection_sigma)
     capture_px = captured_m / sensor.link_length_m * px_per_rad
     reach_px = capture_px * (1 - acquisition.field_overlap)

@@ -14,7 +14,7 @@ from fitctl.controllers.feedforward import link_matrix
 from fitctl.loop.metrology import MetrologyLoop
 from fitctl.messages.modes import Mode
 from fitctl.model.hysteresis import play
-from fitctl.model.optics import AzEl, Scales, motor_sky_rad_per_rad
+from fitctl.model.optics import AzEl, Scales
 from fitctl.stages.servo import ServoState
 from fitctl.stages.siderostat import SiderostatStage
 
@@ -69,8 +69,8 @@ class Link:
         self._matrix = link_matrix(
             0.0 if given is None else given.gain,
             np.eye(2) if given is None else given.matrix,
-            motor_sky_rad_per_rad(loop.settings.siderostat),
-            motor_sky_rad_per_rad(settings.siderostat),
+            loop.settings.siderostat.sky_rad_per_motor_rad,
+            settings.siderostat.sky_rad_per_motor_rad,
         )
         self._zeros_lost = loop.zeros_lost
         self._settle_s = settings.acquisition.settle_s
@@ -181,7 +181,7 @@ class BacklashFeedforward:
         self._stages = link.loop.siderostat, own
         self._half_rad = [
             np.full(2, (one.backlash_sky_arcsec or 0.0) / ARCSEC_PER_RAD / 2)
-            / motor_sky_rad_per_rad(one)
+            / one.sky_rad_per_motor_rad
             for one in (link.loop.settings.siderostat, settings.siderostat)
         ]
         self._beams_rad = [stage.servo.position_rad for stage in self._stages]

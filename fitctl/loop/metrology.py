@@ -39,7 +39,7 @@ from fitctl.messages.modes import (
     Trigger,
 )
 from fitctl.messages.telemetry import LoopLimits, LoopState
-from fitctl.model.optics import motor_sky_rad_per_rad, rotation, sky_px_per_rad
+from fitctl.model.optics import rotation, sky_px_per_rad
 from fitctl.stages.journal import Journal
 from fitctl.stages.servo import ServoState, SiderostatServo
 from fitctl.stages.siderostat import SiderostatStage
@@ -121,7 +121,7 @@ class MetrologyLoop(Loop):
         self._photodiode_error: DeviceError | None = None
         self._asked = Acquire()
         self.zeros_lost = 0
-        self._motor_sky = motor_sky_rad_per_rad(settings.siderostat)
+        self._motor_sky = settings.siderostat.sky_rad_per_motor_rad
         self._turn = rotation(settings.siderostat.rotation_deg)
         self._pull_in_rad_s = PULL_IN * settings.siderostat.velocity_limit_rad_s * self._motor_sky
         self._late_s = rig.camera.frame_delay_s + rig.supervisor.late_tick_s

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import ARCSEC_PER_RAD, AxisPair, Loop, Rig, Siderostat
+from fitctl.config import ARCSEC_PER_RAD, AxisPair, Loop, Rig
 from fitctl.model.compiled import compilable
 
 Floats = NDArray[np.float64]
@@ -96,7 +95,7 @@ def scales(rig: Rig, loop: Loop) -> Scales:
     pixel_size_m = rig.camera.pixel_size_m
     siderostat = loop.siderostat
     px_per_rad = sky_px_per_rad(rig)
-    motor_sky = motor_sky_rad_per_rad(siderostat)
+    motor_sky = siderostat.sky_rad_per_motor_rad
     siderostat_turn = stage_turn(siderostat.rotation_deg, siderostat.axis_gains)
     mirror_turn = stage_turn(loop.fsm.rotation_deg, loop.fsm.axis_gains)
     return Scales(
@@ -134,11 +133,6 @@ def star_rate_px_s(rate_sky_arcsec_s: AxisPair | None, scale: Scales) -> Floats:
 def sky_px_per_rad(rig: Rig) -> float:
     """Beam angle on the sky, before the compressor, to focal plane."""
     return rig.optics.compressor_ratio * rig.optics.focal_length_m / rig.camera.pixel_size_m
-
-
-def motor_sky_rad_per_rad(siderostat: Siderostat[Any]) -> float:
-    """Siderostat motor to beam on the sky: it is a mirror, whose beam turns by twice its own angle."""
-    return siderostat.sky_rad_per_motor_rad
 
 
 def rotation(angle_deg: float) -> Floats:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import ARCSEC_PER_RAD, Rig
-from fitctl.model.optics import motor_sky_rad_per_rad
+from fitctl.config import Rig
 from fitctl.stages.servo import SiderostatServo
 
 Floats = NDArray[np.float64]
@@ -38,7 +37,7 @@ class SiderostatStage:
         self.servo = servo
         self.setpoint_rad = np.zeros(2)
         self.wanted_fraction = 0.0
-        self._motor_sky_arcsec_per_rad = motor_sky_rad_per_rad(siderostat) * ARCSEC_PER_RAD
+        self._motor_sky_arcsec_per_rad = siderostat.sky_arcsec_per_motor_rad
         self.travel_rad = siderostat.travel_rad
 
     def hold(self, motor_rad: Floats) -> None:

@@ -12,7 +12,7 @@ from fitctl.loop.loop import Loop
 from fitctl.loop.stellar import StellarLoop
 from fitctl.messages.commands import Jog, SetBiasOffset
 from fitctl.messages.modes import Mode
-from fitctl.model.optics import motor_sky_rad_per_rad, sky_px_per_rad
+from fitctl.model.optics import sky_px_per_rad
 
 Floats = NDArray[np.float64]
 
@@ -62,7 +62,7 @@ def _beyond(rig: Rig, loop: Loop, step_sky_arcsec: Floats) -> str:
     if not np.abs(step_sky_arcsec).max() <= most_arcsec:  # not-a-number too
         return f"a jog is at most a field of view, {most_arcsec:.1f} arcsec on the sky"
     stage, settings = loop.siderostat, loop.settings.siderostat
-    step_rad = step_sky_arcsec / ARCSEC_PER_RAD / motor_sky_rad_per_rad(settings)
+    step_rad = step_sky_arcsec / ARCSEC_PER_RAD / settings.sky_rad_per_motor_rad
     if np.abs(stage.setpoint_rad + step_rad).max() > stage.travel_rad:
         return (
             f"siderostat {loop.name} would leave its travel of ±{settings.travel_sky_arcsec:g} arcsec on "

@@ -250,7 +250,8 @@ class ConsoleApp(App[None]):
                 self.set_timer(self._notice_s.pop(notice.identity), partial(self._unnotify, notice))
 
     def _draw_due(self) -> None:
-        self._time_notices()
+        if self._notice_s:  # to look for them takes a walk through all widgets
+            self._time_notices()
         if self.pace.due():
             self._beat += 1
             self._draw(self._beat)

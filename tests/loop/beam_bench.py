@@ -11,7 +11,6 @@ from fitctl.loop.metrology import metrology_loop
 from fitctl.messages.commands import Acquire
 from fitctl.messages.modes import Mode, Trigger
 from fitctl.model.metrology.photodiodes import diode_volts
-from fitctl.model.optics import motor_sky_rad_per_rad
 from fitctl.stages.journal import Journal
 
 RIG = default_rig_path().with_name("fit-testbed.toml")
@@ -91,7 +90,7 @@ class Bench:
 
     def beam_m(self):
         """The beam from the centre of the photodiodes."""
-        motor = motor_sky_rad_per_rad(self.settings.siderostat) * self.motors.position_rad
+        motor = self.settings.siderostat.sky_rad_per_motor_rad * self.motors.position_rad
         half = self._half_play_rad
         self._beam_rad = np.clip(self._beam_rad, motor - half, motor + half)
         length_m = self.truth.link_length_m

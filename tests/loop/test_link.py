@@ -16,7 +16,6 @@ from fitctl.messages.commands import (
     Stop,
 )
 from fitctl.messages.modes import Mode
-from fitctl.model.optics import ARCSEC_PER_RAD, motor_sky_rad_per_rad
 from fitctl.simulation.simulation import Simulation
 from fitctl.simulation.statistics import true_residual_rms
 
@@ -373,7 +372,7 @@ def test_a_place_that_a_command_gives_is_one_with_the_link_as_it_is(held):
     held.drift(0.3)
     held.run(30.0)
     siderostat = held.loop(LEFT).settings.siderostat
-    arcsec_per_rad = motor_sky_rad_per_rad(siderostat) * ARCSEC_PER_RAD
+    arcsec_per_rad = siderostat.sky_arcsec_per_motor_rad
     az_arcsec, el_arcsec = (-arcsec_per_rad * held.loop(LEFT).servo.position_rad).tolist()
     assert held.command(Release(loop=LEFT)).accepted
     held.run(0.5)

@@ -10,7 +10,6 @@ from fitctl.model.hexapod_motion import at_rest
 from fitctl.model.metrology import part as metrology_part
 from fitctl.model.metrology.geometry import array_lever, star_turn
 from fitctl.model.metrology.photodiodes import diode_volts
-from fitctl.model.optics import motor_sky_rad_per_rad
 from fitctl.model.plant import Plant
 
 TESTBED = default_rig_path().parent / "fit-testbed.toml"
@@ -89,7 +88,7 @@ def test_the_collector_siderostat_can_turn_the_left_star_back():
 @pytest.mark.parametrize("loop", ["right", "metrology", "left"])
 def test_every_siderostat_has_backlash(loop):
     plant = still_plant()
-    width_rad = 1.0 / ARCSEC_PER_RAD / motor_sky_rad_per_rad(rig_with().loops[loop].siderostat)
+    width_rad = 1.0 / ARCSEC_PER_RAD / rig_with().loops[loop].siderostat.sky_rad_per_motor_rad
     turn(plant, loop, [1.0, 0.0], 1.0)
     part = plant.loops[loop]
     beam = part.state.beam_motor_rad[0].copy()

@@ -20,7 +20,7 @@ from fitctl.controllers.photodiodes import BeamState, PhotodiodeArray
 from fitctl.daemon.devices import HEXAPODS, PHOTODIODES
 from fitctl.drivers.interface import DeviceError, Hexapod, Photodiodes, Pose
 from fitctl.model.metrology.geometry import transverse_axes
-from fitctl.model.optics import motor_sky_rad_per_rad, rotation
+from fitctl.model.optics import rotation
 
 Floats = NDArray[np.float64]
 STEP_M = 5e-3  # of the beam at the array
@@ -55,7 +55,7 @@ class BeamWatch:
         self._clock = site.clock
         siderostat = self.loop.siderostat
         self._m_per_rad = (
-            motor_sky_rad_per_rad(siderostat)
+            siderostat.sky_rad_per_motor_rad
             * self.loop.sensor.link_length_m
             * rotation(siderostat.rotation_deg)
         )

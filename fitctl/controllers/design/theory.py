@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from fitctl.config import ARCSEC_PER_RAD, Rig
+from fitctl.config import Rig
 from fitctl.controllers.design.basis import Basis, basis, basis_of, night_of
 from fitctl.controllers.design.choose import DESIGNS
 from fitctl.controllers.design.linear_loop.loopshape import sampled_response
@@ -16,7 +16,7 @@ from fitctl.controllers.design.margins import frequencies_hz
 from fitctl.controllers.feedforward import link_matrix
 from fitctl.controllers.pair import Design
 from fitctl.error_budget import LoopTheory
-from fitctl.model.optics import motor_sky_rad_per_rad, scales
+from fitctl.model.optics import scales
 
 _QUICKER = 20
 """So many times the frame rate stands for a loop without hold."""
@@ -44,11 +44,9 @@ def loop_theory(rig: Rig, loop_name: str, design: Design) -> LoopTheory:
         link = rig.loops[loop.link].siderostat
         matrix = np.eye(2) if loop.feedforward is None else loop.feedforward.matrix
         link_px_per_rad = motor_px_per_rad @ link_matrix(
-            1.0, matrix, motor_sky_rad_per_rad(link), motor_sky_rad_per_rad(loop.siderostat)
+            1.0, matrix, link.sky_rad_per_motor_rad, loop.siderostat.sky_rad_per_motor_rad
         )
-        link_backlash_rad = _half_width_rad(
-            link.backlash_sky_arcsec, motor_sky_rad_per_rad(link) * ARCSEC_PER_RAD
-        )
+        link_backlash_rad = _half_width_rad(link.backlash_sky_arcsec, link.sky_arcsec_per_motor_rad)
     sensitivity = 1 / (1 + sampled_response(design, its_basis)(omega_rad_s))
     undelayed = np.abs(sensitivity)
     if not design.own:  # of matrices without a maker, what delay and hold cost counts as air

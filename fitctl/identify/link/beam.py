@@ -24,7 +24,7 @@ from fitctl.identify.record import axis_pair
 from fitctl.identify.slow_mean import correlation
 from fitctl.logging.reading import Columns
 from fitctl.model.metrology.photodiodes import diode_volts
-from fitctl.model.optics import motor_sky_rad_per_rad, rotation
+from fitctl.model.optics import rotation
 
 Floats = NDArray[np.float64]
 STEP = "beam_scan"
@@ -189,7 +189,7 @@ class _Scan:
         self.sampled_s = ticks["sampled_s"]
         self.delays_s = ticks["time_s"] - self.sampled_s
         self._turn_mm = 1e3 * sensor.link_length_m * rotation(loop.siderostat.rotation_deg).T
-        self._arcsec_rad = motor_sky_rad_per_rad(loop.siderostat) * ARCSEC_PER_RAD
+        self._arcsec_rad = loop.siderostat.sky_arcsec_per_motor_rad
         counts_per_rev = loop.siderostat.encoder_counts_per_rev
         self.counted_arcsec = self._arcsec_rad * 2 * np.pi / counts_per_rev / np.sqrt(6)
         # The encoders as the samples were taken, and as the ticks read them: a motor that passes its set-point

@@ -22,7 +22,7 @@ from fitctl.identify.record import axis_pair
 from fitctl.identify.whitening import whitener
 from fitctl.logging.reading import Columns
 from fitctl.model.hysteresis import displacement_series
-from fitctl.model.optics import mirror_from_stacks, motor_sky_rad_per_rad, scales
+from fitctl.model.optics import mirror_from_stacks, scales
 
 Floats = NDArray[np.float64]
 AXES = ("az", "el")
@@ -142,7 +142,7 @@ def analyse(rig: Rig, loop_name: str, ticks: Columns) -> FeedforwardResult:
         raise IdentifyError(msg)
     scale = scales(rig, loop)
     times_s, star_px = ticks["mid_exposure_s"], axis_pair(ticks, "star_{}_px")
-    link_sky_rad = motor_sky_rad_per_rad(rig.metrology_loops[loop.link].siderostat)
+    link_sky_rad = rig.metrology_loops[loop.link].siderostat.sky_rad_per_motor_rad
     link_px = axis_pair(ticks, "link_{}_rad") * link_sky_rad * scale.sky_px_per_rad
     own_px = axis_pair(ticks, "siderostat_{}_rad") * scale.motor_px_per_rad
     mirror_px = scale.mirror_px(_mirror_rad(loop.fsm, ticks))

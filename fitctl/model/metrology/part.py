@@ -17,7 +17,7 @@ from fitctl.config import ARCSEC_PER_RAD, AirPath, LinkAir, MetrologyPlant, Rig
 from fitctl.model.compiled import compilable, compiled, numba_installed
 from fitctl.model.metrology.collector import CollectorPart
 from fitctl.model.metrology.photodiodes import diode_volts
-from fitctl.model.optics import motor_sky_rad_per_rad, rotation, turned
+from fitctl.model.optics import rotation, turned
 from fitctl.model.plant_constants import AirConstants, air_constants
 from fitctl.model.plant_step import step_motor
 from fitctl.model.randomness import disc_place, run_randomness
@@ -72,7 +72,7 @@ def beam_constants(rig: Rig, loop_name: str) -> BeamConstants:
     plant = truth.metrology_loops[loop_name]
     siderostat = rig.metrology_loops[loop_name].siderostat
     lag_s = 1 / (2 * np.pi * plant.amplifier_bandwidth_hz)
-    motor_sky = motor_sky_rad_per_rad(siderostat)
+    motor_sky = siderostat.sky_rad_per_motor_rad
     return BeamConstants(
         step_s=truth.step_s,
         amplifier_decay=float(np.exp(-truth.step_s / lag_s)),

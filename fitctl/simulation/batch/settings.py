@@ -33,7 +33,7 @@ from fitctl.model.image.pixel_noise import quantiles
 from fitctl.model.image.scene import photon_dn
 from fitctl.model.lines import FIELDS as LINE_FIELDS
 from fitctl.model.metrology.part import BeamConstants
-from fitctl.model.optics import motor_sky_rad_per_rad, scales, sky_px_per_rad
+from fitctl.model.optics import scales, sky_px_per_rad
 from fitctl.model.plant import exposure_instants_s, pixel_noises
 from fitctl.model.plant_constants import AirConstants, PlantConstants
 from fitctl.simulation.batch.interlocks import acting_interlocks
@@ -231,7 +231,7 @@ def beam_settings(
     truth, _ = rig.mock_parts()
     plant, acquisition, sensor = truth.metrology_loops[loop_name], loop.acquisition, loop.sensor
     plan = plan_beam_spiral(rig, loop_name)
-    motor_sky, px_per_rad = motor_sky_rad_per_rad(loop.siderostat), sky_px_per_rad(rig)
+    motor_sky, px_per_rad = loop.siderostat.sky_rad_per_motor_rad, sky_px_per_rad(rig)
     if plant.link_round_trip_s / camera.period_s + 2 > MOST_REQUESTS:
         msg = f"its link's round trip is longer than {MOST_REQUESTS} frames, which the batch holds"
         raise BatchRefusalError(msg)
@@ -454,8 +454,8 @@ def _link_matrix(rig: Rig, loop_name: str) -> Floats:
     return link_matrix(
         0.0 if given is None else given.gain,
         np.eye(2) if given is None else given.matrix,
-        motor_sky_rad_per_rad(link.siderostat),
-        motor_sky_rad_per_rad(loop.siderostat),
+        link.siderostat.sky_rad_per_motor_rad,
+        loop.siderostat.sky_rad_per_motor_rad,
     )
 
 

@@ -19,7 +19,7 @@ from fitctl.commissioning.steps.beam import (
 from fitctl.config import default_rig_path, load_rig
 from fitctl.drivers.interface import DiodeReading
 from fitctl.model.metrology.geometry import transverse_axes
-from fitctl.model.optics import motor_sky_rad_per_rad, rotation
+from fitctl.model.optics import rotation
 
 RIG = load_rig(default_rig_path().with_name("fit-testbed.toml"))
 OFFSET_M = RIG.metrology_loops["metrology"].sensor.diode_offset_m
@@ -78,8 +78,8 @@ class BeamDiodes:
         self.bench, self.start_m, self.order = bench, np.array(start_m), order
         self.light = np.array(light)
         self.sensor = RIG.metrology_loops["metrology"].sensor
-        self.m_per_rad = self.sensor.link_length_m * motor_sky_rad_per_rad(
-            RIG.loops["metrology"].siderostat
+        self.m_per_rad = (
+            self.sensor.link_length_m * RIG.loops["metrology"].siderostat.sky_rad_per_motor_rad
         )
 
     def open(self):

@@ -11,7 +11,6 @@ from fitctl.identify.errors import IdentifyError
 from fitctl.identify.link import beam
 from fitctl.model import air_path
 from fitctl.model.metrology.photodiodes import diode_volts
-from fitctl.model.optics import motor_sky_rad_per_rad
 from fitctl.sequences.behaviours.scans import beam_course
 from fitctl.sequences.steps import BeamScan
 
@@ -67,7 +66,7 @@ def scan(seed, **sensor):
     truth = TRUE_SENSOR.model_copy(update=sensor)
     volts = diode_volts(truth, place_m)
     volts += truth.noise_v * random.standard_normal(volts.shape)
-    arcsec_per_rad = motor_sky_rad_per_rad(LOOP.siderostat) * ARCSEC_PER_RAD
+    arcsec_per_rad = LOOP.siderostat.sky_arcsec_per_motor_rad
     count_rad = 2 * np.pi / LOOP.siderostat.encoder_counts_per_rev
 
     def encoders(times_s):

@@ -14,7 +14,6 @@ from fitctl.model import air_path
 from fitctl.model.hysteresis import displacement_series
 from fitctl.model.optics import (
     mirror_from_stacks,
-    motor_sky_rad_per_rad,
     rotation,
     scales,
     stack_volts,
@@ -80,7 +79,7 @@ def scan(seed, swing_arcsec=60.0, rig=RIG, jumps_arcsec=0.0):
     noise_px = sensor_noise_px(rig.camera, rig.stellar_loops["left"], LOOP.star_flux_dn)
     star_px = np.array([12.0, 20.0]) + moved_px + scale.mirror_px(mirror_rad)
     star_px += noise_px * random.standard_normal(star_px.shape)
-    link_sky = motor_sky_rad_per_rad(RIG.metrology_loops["metrology"].siderostat)
+    link_sky = RIG.metrology_loops["metrology"].siderostat.sky_rad_per_motor_rad
     columns = {
         "mid_exposure_s": times_s,
         "fsm_written_s": times_s - 0.1 * period_s,
