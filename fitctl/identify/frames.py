@@ -14,7 +14,7 @@ from fitctl.config import HALF_WINDOW_PX, Camera, Loop, Range
 from fitctl.controllers.centroid import Star, StarSensor
 from fitctl.identify.errors import IdentifyError
 from fitctl.identify.record import tick_columns
-from fitctl.logging.reading import log_info, read_records, tick_arrays
+from fitctl.logging.reading import clock_of, log_info, read_records, tick_arrays
 from fitctl.logging.records import AnyRecord, FrameRecord, Tick
 from fitctl.logging.schemas import TOPICS
 from fitctl.messages.modes import Mode
@@ -128,15 +128,15 @@ def frames_of_log(path: Path, loop_name: str) -> Iterator[TimedImage]:
     IdentifyError
         If the log has no frames, none from stages at rest, or one whose size does not fit its height.
     LogError
-        If the log cannot be read, or has no ticks of this loop.
+        If the log cannot be read, has no ticks of this loop, or does not say what its times are.
     """
     start_s, end_s = longest_rest(tick_arrays(path, loop_name))
     info = log_info(path)
     topic = TOPICS[FrameRecord]
     if not info.counts.get(topic):
-        msg = f"{path}: holds no frames; expected topic {topic}; record with the camera on"
+        msg = f"the log has no frames; expected topic {topic}; record with the camera on"
         raise IdentifyError(msg)
-    offset_s = float(info.metadata["clock"]["wall_minus_monotonic_s"])
+    offset_s = clock_of(path, info.metadata).wall_minus_monotonic_s
     for entry in read_records(path, [topic]):
         time_s = entry.publish_time_ns / 1e9 - offset_s
         if start_s - _CLOCK_S <= time_s <= end_s + _CLOCK_S:

@@ -204,14 +204,12 @@ def read_bench(path: Path, fsm: Fsm) -> BenchRecord:
     try:
         columns = _read_columns(path)
     except (OSError, EOFError, BadZipFile, ValueError, KeyError, IndexError) as error:
-        msg = (
-            f"{path}: not a bench record ({error}); expected NPZ or CSV with {', '.join(_COLUMNS)}"
-        )
+        msg = f"not a bench record ({error}); expected NPZ or CSV with {', '.join(_COLUMNS)}"
         raise IdentifyError(msg) from error
     time_s, drive_v, *detector = columns
     steps_s = np.diff(time_s)
     if len(steps_s) == 0 or np.ptp(steps_s) > 0.1 * abs(steps_s.mean()) or steps_s.mean() <= 0:
-        msg = f"{path}: time_s does not rise evenly; expected samples at a constant rate"
+        msg = "time_s does not rise evenly; expected samples at a constant rate"
         raise IdentifyError(msg)
     detector_v = np.column_stack(detector)
     return BenchRecord(

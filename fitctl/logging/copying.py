@@ -29,6 +29,9 @@ from fitctl.logging.folder import in_use
 # A recorder that dies leaves a quarter of logging.queue_records unconfirmed, and that is a million at the most.
 _REMEMBERED = 250_000
 
+COPY = "copy"
+"""Name of the metadata that a log has which was made from others."""
+
 
 class _Copied(NamedTuple):
     """A message and what is needed to understand it."""
@@ -46,6 +49,7 @@ class _Source:
     finished: bool = True
     damaged_chunks: int = 0
     undescribed: int = 0
+    went_back: int = 0
     unread_bytes: int = 0
 
     def entries(self) -> Iterator[_Copied | Metadata]:
@@ -54,6 +58,7 @@ class _Source:
             size = os.fstat(stream.fileno()).st_size
             schemas: Described[Schema] = Described(self.path)
             channels: Described[Channel] = Described(self.path)
+            newest_ns = 0
             if self.finished:  # the index knows the channels, even those of a damaged chunk
                 with contextlib.suppress(*DAMAGE):
                     summary = SeekingReader(stream).get_summary()
@@ -77,6 +82,8 @@ class _Source:
                                 yield record
                             case Message() if record.channel_id in channels:
                                 channel = channels[record.channel_id]
+                                self.went_back += record.log_time < newest_ns
+                                newest_ns = max(newest_ns, record.log_time)
                                 yield _Copied(schemas.get(channel.schema_id), channel, record)
                             case Message():
                                 self.undescribed += 1
@@ -85,7 +92,7 @@ class _Source:
 
     def insist_sound(self) -> None:
         """Refuse to go on with a file that lacks something in its midst; a cut end is none."""
-        if self.damaged_chunks or (self.finished and self.unread_bytes):
+        if self.damaged_chunks or self.went_back or (self.finished and self.unread_bytes):
             msg = f"{self.path}: is damaged; repair it with `fitctl log recover` first"
             raise LogError(msg)
 
@@ -111,6 +118,7 @@ class _Target:
             raise LogError(msg)
         self.path = path
         self.records = 0
+        self._log_time_ns = 0
         self._metadata: set[tuple[str, tuple[tuple[str, str], ...]]] = set()
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._channels: dict[tuple[str, str, int], int] = {}
@@ -122,6 +130,7 @@ class _Target:
             with replaced_whole(self.path) as file:
                 self._mcap = Writer(file, enable_data_crcs=True, use_summary_offsets=False)
                 self._mcap.start(library="fitctl")
+                self.add(Metadata(COPY, {"by": "fitctl log"}))
                 yield
                 self._mcap.finish()
         except OSError as error:
@@ -129,7 +138,7 @@ class _Target:
             raise LogError(msg) from error
 
     def add(self, entry: _Copied | Metadata) -> None:
-        """Copy one entry; metadata that is there already is not added again."""
+        """Copy one entry; metadata that is there already is not added again, and log times never go back."""
         if isinstance(entry, Metadata):
             known = entry.name, tuple(sorted(entry.metadata.items()))
             if known not in self._metadata:
@@ -137,9 +146,10 @@ class _Target:
                 self._mcap.add_metadata(entry.name, entry.metadata)
             return
         message = entry.message
+        self._log_time_ns = max(self._log_time_ns, message.log_time)
         self._mcap.add_message(
             channel_id=self._channel(entry),
-            log_time=message.log_time,
+            log_time=self._log_time_ns,
             data=message.data,
             publish_time=message.publish_time,
             sequence=message.sequence,
@@ -172,6 +182,8 @@ class Recovered:
         Passed over; each holds what was recorded between two flushes, at the most.
     undescribed : int
         Records that cannot be read: only a damaged chunk described their topic.
+    went_back : int
+        Records saved whose log time was earlier than one before them; they have that one's now.
     unread_bytes : int
         At the end, from where the file stops making sense.
     """
@@ -179,6 +191,7 @@ class Recovered:
     records: int
     damaged_chunks: int
     undescribed: int
+    went_back: int
     unread_bytes: int
 
 
@@ -198,7 +211,11 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
             msg = f"{source}: holds no whole record, so there is nothing to recover"
             raise LogError(msg)
     return Recovered(
-        writing.records, reading.damaged_chunks, reading.undescribed, reading.unread_bytes
+        writing.records,
+        reading.damaged_chunks,
+        reading.undescribed,
+        reading.went_back,
+        reading.unread_bytes,
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from fitctl.logging.copying import COPY
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import LogInfo, log_info
 
@@ -27,7 +28,8 @@ def rig_name(log: LogInfo) -> str:
 def newest_run(folder: Path, rig: str) -> list[Path]:
     """All files of the newest run of a rig, oldest first, as ``--latest`` chooses them.
 
-    Names are not compared: a log counts by its first record, whatever its file is called.
+    Names are not compared: a log counts by its first record, whatever its file is called. What `fitctl log`
+    cut, merged or recovered counts only where none of the run's own files is left.
 
     Parameters
     ----------
@@ -45,4 +47,10 @@ def newest_run(folder: Path, rig: str) -> list[Path]:
     if not of_rig:
         return []
     clock = of_rig[-1].metadata.get("clock")
-    return [log.path for log in of_rig if log.metadata.get("clock") == clock]
+    run = [log for log in of_rig if log.metadata.get("clock") == clock]
+    return [log.path for log in recorded(run)]
+
+
+def recorded(run: list[LogInfo]) -> list[LogInfo]:
+    """The logs of a run that its recorders wrote; where only copies are left that `fitctl log` made, these."""
+    return [log for log in run if COPY not in log.metadata] or run

@@ -42,6 +42,7 @@ _COLUMNS: dict[int, tuple[str, Any]] = {
 }
 _MOST_CHARACTERS = 200_000_000  # of a column of texts, of four bytes each
 Columns = dict[str, NDArray[Any]]
+_MOST_CLOCK_S = 1e15
 HEADER = ("log_time_ns", "publish_time_ns", "sequence")
 """The columns that every topic has."""
 
@@ -322,6 +323,32 @@ def log_info(path: Path) -> LogInfo:
         metadata={entry.name: entry.metadata for entry in described},
         runs=len({tuple(entry.metadata.items()) for entry in described if entry.name == "clock"}),
     )
+
+
+class LogClock(NamedTuple):
+    """The clocks of a run, seconds: how its wall clock and its monotonic clock differ, and when it began."""
+
+    wall_minus_monotonic_s: float
+    run_start_monotonic_s: float
+
+
+def clock_of(path: Path, metadata: Mapping[str, Mapping[str, str]]) -> LogClock:
+    """The clocks that a log's metadata has.
+
+    Raises
+    ------
+    LogError
+        If it has none, or no usable numbers.
+    """
+    clock = metadata.get("clock", {})
+    try:
+        found = LogClock(*(float(clock[name]) for name in LogClock._fields))
+    except (KeyError, ValueError):
+        found = LogClock(math.nan, math.nan)
+    if not all(abs(value) < _MOST_CLOCK_S for value in found):
+        msg = f"{path}: has no start of its run (metadata clock); name a log that fitctl recorded"
+        raise LogError(msg)
+    return found
 
 
 def logs_of_one_run_each(paths: Sequence[Path]) -> list[LogInfo]:

@@ -14,7 +14,13 @@ from typing import Any, NamedTuple
 from fitctl.config import Rig
 from fitctl.logging.copying import merge
 from fitctl.logging.errors import LogError
-from fitctl.logging.reading import LogInfo, log_info, logs_of_one_run_each, read_records
+from fitctl.logging.reading import (
+    LogInfo,
+    clock_of,
+    log_info,
+    logs_of_one_run_each,
+    read_records,
+)
 from fitctl.logging.records import (
     CAMERA,
     AnyRecord,
@@ -264,13 +270,7 @@ def _insist_on_field(info: LogInfo, tick: Any, field_name: str, lacks: str) -> N
 
 
 def _insist_on_start(info: LogInfo, first_ns: int) -> None:
-    clock = info.metadata.get("clock", {})
-    try:
-        start_s = float(clock["run_start_monotonic_s"]) + float(clock["wall_minus_monotonic_s"])
-    except (KeyError, ValueError):
-        msg = f"{info.path}: has no start of its run (metadata clock); name a log that fitctl recorded"
-        raise LogError(msg) from None
-    late_s = first_ns / 1e9 - start_s
+    late_s = first_ns / 1e9 - sum(clock_of(info.path, info.metadata))
     if late_s > _AT_THE_START_S:
         raise _midst(info, f"its first record is of {late_s:.0f} s after the run's start")
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from fitctl.config import CONTROLLERS, Rig, is_name, rig_from_log
 from fitctl.logging.errors import LogError
+from fitctl.logging.listing import recorded
 from fitctl.logging.reading import LogInfo, log_info, logs_of_one_run_each
 from fitctl.logging.schemas import designs_of
 
@@ -91,7 +92,7 @@ def _newest_run(folder: Path) -> list[LogInfo]:
         msg = f"{folder}: holds no log of fitctl (*.mcap); name a file, or the rig's logging.folder"
         raise LogError(msg)
     newest = max(logs, key=lambda log: log.start_s)
-    return [log for log in logs if _identity(log) == _identity(newest)]
+    return recorded([log for log in logs if _identity(log) == _identity(newest)])
 
 
 def _identity(log: LogInfo) -> tuple[str, ...]:

@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from samples.log_samples import filled
 
 from fitctl.config import AxisPair, Spot
 from fitctl.identify.errors import IdentifyError
@@ -15,6 +16,7 @@ from fitctl.identify.frames import (
     track_spots,
 )
 from fitctl.identify.record import tick_columns
+from fitctl.logging.errors import LogError
 from fitctl.logging.records import FrameRecord, RunInfo, Tick
 from fitctl.logging.writer import LogWriter
 from fitctl.messages.modes import Mode
@@ -221,7 +223,16 @@ def test_a_log_without_frames_is_refused(rig, tmp_path):
         log.write(RUN_INFO, 0.0)
         for made in still_from(100, 200, ticks=250):
             log.write(made, 0.0)
-    with pytest.raises(IdentifyError, match="holds no frames"):
+    with pytest.raises(IdentifyError, match="has no frames"):
+        list(frames_of_log(path, "right"))
+
+
+def test_a_log_that_does_not_say_what_its_times_are_is_refused(rig, tmp_path):
+    path = tmp_path / "run.mcap"
+    with LogWriter(path, rig.logging) as log:
+        for made in [*still_from(100, 200, ticks=250), filled(FrameRecord, width_px=40)]:
+            log.write(made, 0.0)
+    with pytest.raises(LogError, match=r"run\.mcap: has no start of its run"):
         list(frames_of_log(path, "right"))
 
 

@@ -18,7 +18,7 @@ from samples.log_samples import (
     write_log,
 )
 
-from fitctl.logging.copying import cut, merge, recover
+from fitctl.logging.copying import COPY, cut, merge, recover
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import log_info, read_records
 from fitctl.logging.verifying import verify
@@ -27,6 +27,7 @@ from fitctl.replay.log import whole_run
 from fitctl.report.run import find_run
 
 FOREVER_NS = 2**63
+COPIED = {COPY: {"by": "fitctl log"}}
 RECORDS = [RUN_INFO, *(record for n in range(12) for record in (tick(n), frame(n)))]
 
 
@@ -96,7 +97,7 @@ def test_one_damaged_chunk_costs_its_own_records_only(whole):
 def test_the_runs_description_is_recovered_too(whole):
     path, _ = whole
     recovered(path, path.read_bytes()[:20_000])
-    assert log_info(path.with_name("recovered.mcap")).metadata == log_info(path).metadata
+    assert log_info(path.with_name("recovered.mcap")).metadata == log_info(path).metadata | COPIED
 
 
 def test_a_log_without_a_whole_record_is_refused_and_nothing_is_left(tmp_path):
@@ -160,7 +161,7 @@ def test_a_cut_has_the_chosen_time_and_topics_and_the_runs_description(tmp_path)
     assert contents(target) == contents(path)[2:8]
     assert cut(path, target, **span, topics=["/fit/right/tick"], overwrite=True) == 3
     assert [entry.sequence for entry in read_records(target)] == [1, 2, 3]
-    assert log_info(target).metadata == log_info(path).metadata
+    assert log_info(target).metadata == log_info(path).metadata | COPIED
     assert verify(target).problems == ()
 
 
@@ -207,7 +208,7 @@ def test_a_merged_log_has_every_record_once_in_order(tmp_path_factory, owners, a
     assert merge([folder / f"{n}.mcap" for n in range(3)], target) == (len(owners), len(doubles))
     assert [entry.sequence for entry in read_records(target)] == list(range(len(owners)))
     assert verify(target).problems == ()
-    assert log_info(target).metadata == log_info(folder / "0.mcap").metadata
+    assert log_info(target).metadata == log_info(folder / "0.mcap").metadata | COPIED
 
 
 def test_records_that_only_a_damaged_chunk_describes_are_counted(tmp_path):
@@ -229,6 +230,30 @@ def test_records_that_only_a_damaged_chunk_describes_are_counted(tmp_path):
     assert 0 < saved.undescribed < everything
     assert saved.records + saved.undescribed < everything  # the rest was in the damaged chunk
     assert log_info(tmp_path / "recovered.mcap").counts.keys() < log_info(whole).counts.keys()
+
+
+def test_log_times_that_go_back_are_mended_and_counted(tmp_path):
+    path, target = tmp_path / "a.mcap", tmp_path / "mended.mcap"
+    with LogWriter(path, SETTINGS) as writer:
+        for number, later_s in enumerate((0.0, 5.0, 1.0, 5.0, 3.0, 6.0)):
+            writer.write(frame(number), WALL_S + later_s)
+
+    saved = recover(path, target)
+
+    assert (saved.records, saved.went_back) == (6, 2)
+    assert verify(target).problems == ()
+    assert [entry.sequence for entry in read_records(target)] == [
+        entry.sequence for entry in read_records(path)
+    ]
+    for copy in (lambda: merge([path, target], tmp_path / "b.mcap"), lambda: cut_all(path)):
+        with pytest.raises(
+            LogError, match=r"a\.mcap: is damaged; repair it with `fitctl log recover`"
+        ):
+            copy()
+
+
+def cut_all(path):
+    return cut(path, path.with_name("cut.mcap"), from_ns=0, to_ns=FOREVER_NS)
 
 
 def test_a_log_says_of_how_many_runs_it_is(tmp_path):

@@ -290,6 +290,8 @@ def recover(
     lost = f"{saved.damaged_chunks} damaged chunks skipped, " if saved.damaged_chunks else ""
     if saved.undescribed:
         lost += f"{saved.undescribed} records lost that only a damaged chunk describes, "
+    if saved.went_back:
+        lost += f"{saved.went_back} log times that went back set to the one before, "
     say(
         f"{target}: {saved.records} records saved; {lost}{saved.unread_bytes} bytes at the end unreadable"
     )

@@ -23,7 +23,7 @@ from fitctl.controllers.design.document import MATRICES, design_json
 from fitctl.controllers.pair import Design
 from fitctl.learn.advice import standing
 from fitctl.learn.design_basis import estimated
-from fitctl.logging.reading import LogInfo
+from fitctl.logging.reading import LogInfo, clock_of
 from fitctl.logging.schemas import designs_of
 from fitctl.replay.files import logged_files, missing_dark_file
 from fitctl.replay.log import read_steps, whole_run
@@ -219,7 +219,7 @@ def _rig(
 
 def _from_start_s(info: LogInfo, time_s: float) -> float:
     """Seconds after the log's first record, as `fitctl log cut` takes them, of a monotonic time."""
-    return time_s + float(info.metadata["clock"]["wall_minus_monotonic_s"]) - info.start_s
+    return time_s + clock_of(info.path, info.metadata).wall_minus_monotonic_s - info.start_s
 
 
 def _document(named: str, info: LogInfo, rig: Rig, result: ReplayResult) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from typing import Annotated, NamedTuple
 import typer
 
 from fitctl import demo as demos
-from fitctl.commands.shared.exits import FAILED
+from fitctl.commands.shared.exits import FAILED, UNUSABLE
 from fitctl.commands.shared.logs import LatestOption, chosen_log
 from fitctl.commands.shared.options import JsonOption, LoopOption, RigOption, SeedOption, SetOption
 from fitctl.commands.shared.printing import progress_line, say, to_json
@@ -86,7 +86,8 @@ def identify(
 
     Without --log, --latest, --simulate or --mocks, the running supervisor makes the experiment: the loop must
     hold a star in VERNIER. The stages then move open loop; STOP ends the experiment at once. The parameters of
-    a link come from the log of a sequence: name it with --log or --latest.
+    a link come from the log of a sequence: name it with --log or --latest. Exit status 1 if an experiment gives
+    no parameters, 2 if a log gives none.
     """
     if what not in EXPERIMENTS:
         msg = f"identify: unknown experiment {what!r}. Available: {', '.join(EXPERIMENTS)}"
@@ -126,8 +127,8 @@ def identify(
         _write(plot_path, lambda: finding.plot(plot_path))
         text = fragment_text(by, settings, finding.lines(), finding.fragment())
     except (IdentifyError, ConnectionError, demos.DemoError) as error:
-        say(f"identify {what}: {error}", err=True)
-        raise typer.Exit(FAILED) from None
+        say(f"identify {what}: {f'{log}: ' if log else ''}{error}", err=True)
+        raise typer.Exit(UNUSABLE if log else FAILED) from None
     _write(fragment_path, lambda: write_whole(fragment_path, text.encode()))
     if as_json:
         found_values = {"what": what, "loop": loop, "values": finding.fragment()}

@@ -17,7 +17,7 @@ import msgspec
 
 from fitctl.config import is_name
 from fitctl.logging.errors import LogError
-from fitctl.logging.reading import LogMessage
+from fitctl.logging.reading import LogMessage, clock_of
 from fitctl.logging.records import (
     CAMERA,
     AnyRecord,
@@ -93,15 +93,7 @@ class LoggedRun:
     def __init__(self, path: Path, loops_of: Callable[[str], list[LoopState]]) -> None:
         self._log = SeekableLog(path)
         metadata = self._log.metadata
-        try:
-            self._offset_s = float(metadata["clock"]["wall_minus_monotonic_s"])
-        except (KeyError, ValueError):
-            self._offset_s = math.nan
-        if not abs(self._offset_s) < BOUND:
-            msg = (
-                f"{path}: has no start of its run (metadata clock); name a log that fitctl recorded"
-            )
-            raise LogError(msg)
+        self._offset_s = clock_of(path, metadata).wall_minus_monotonic_s
         self._rig_name = plain(metadata.get("rig", {}).get("name", ""))[:40]
         self._scheduling = plain(metadata.get("scheduling", {}).get("policy", ""))[:200]
         self._first_ns, self._last_ns = self._log.span_ns

@@ -9,8 +9,10 @@ from samples.log_samples import RUN_INFO, WALL_S, one_of_each, tick, write_log
 from fitctl.cli import main
 from fitctl.config import default_rig_path, load_rig
 from fitctl.logging.listing import newest_run
+from fitctl.report.run import find_run
 
-RIG = load_rig(default_rig_path()).name
+SHIPPED = load_rig(default_rig_path())
+RIG = SHIPPED.name
 DAY_S = 86400.0
 
 
@@ -78,6 +80,21 @@ def test_latest_is_the_newest_log_of_the_rig_by_time_not_by_name(fitctl, logs, c
     _, text, _ = fitctl(*command, "--latest")
 
     assert text.startswith("logs/b.mcap: ")
+
+
+def test_copies_are_the_newest_run_only_where_none_of_its_own_files_is_left(fitctl, logs):
+    for copy in (("cut",), ("merge", "--out", "logs/merged.mcap")):
+        assert fitctl("log", *copy, "logs/b.mcap")[0] == 0
+
+    assert newest_run(logs, RIG) == [logs / "b.mcap"]
+    assert [one.path for one in find_run([logs], SHIPPED).logs] == [logs / "a.mcap"]
+    (logs / "a.mcap").unlink()
+    assert [one.path for one in find_run([logs], SHIPPED).logs] == [logs / "b.mcap"]
+
+    (logs / "b.mcap").unlink()
+    (logs / "merged.mcap").unlink()
+    assert newest_run(logs, RIG) == [logs / "b_cut.mcap"]
+    assert [one.path for one in find_run([logs], SHIPPED).logs] == [logs / "b_cut.mcap"]
 
 
 def test_latest_goes_before_the_topics_of_a_plot(fitctl, logs):

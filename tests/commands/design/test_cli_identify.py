@@ -5,6 +5,7 @@ from types import SimpleNamespace
 from unittest.mock import patch
 
 import pytest
+from samples.log_samples import RUN_INFO, one_of_each, write_log
 
 from fitctl.cli import main
 from fitctl.commands.design import identify as commands
@@ -83,6 +84,17 @@ def test_only_a_fragment_of_its_own_kind_is_replaced(
     assert (
         "exists already, and was not written by fitctl identify delay --simulate" in err
     ) is is_refused
+
+
+@pytest.mark.parametrize("what", sorted(EXPERIMENTS))
+def test_a_log_from_which_nothing_can_be_learned_is_named(identify, tmp_path, what):
+    write_log(tmp_path / "night.mcap", [RUN_INFO, *one_of_each()])
+
+    status, err = identify(what, "--log", "night.mcap")
+
+    assert status == 2
+    assert err.count("night.mcap: ") == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["night.mcap"]
 
 
 def test_the_help_names_every_experiment(capsys):
