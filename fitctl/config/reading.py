@@ -268,6 +268,8 @@ def rig_from_log(text: str, origin: str, overrides: Sequence[str] = ()) -> Rig:
     except ConfigError as error:
         first, *more = str(error).splitlines()
         also = f" ({len(more)} more)" if more else ""
+        if first.startswith("--set:"):
+            raise ConfigError(first + also) from None
         msg = (
             f"{first}{also}; give a rig file of this fitctl with --rig ('fitctl rig upgrade' makes one of an "
             "older file)"

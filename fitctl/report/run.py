@@ -47,7 +47,9 @@ class Run(NamedTuple):
         return self.logs[-1].metadata
 
 
-def find_run(paths: Sequence[Path], rig: Rig | None = None) -> Run:
+def find_run(
+    paths: Sequence[Path], rig: Rig | None = None, overrides: Sequence[str] = ()
+) -> Run:
     """The run that files, or the newest run that a folder holds.
 
     Parameters
@@ -56,6 +58,8 @@ def find_run(paths: Sequence[Path], rig: Rig | None = None) -> Run:
         Files of one run in any order, or one folder.
     rig : Rig, optional
         In place of the one in the log.
+    overrides : sequence of str
+        Values to replace in the log's rig, as `--set` takes them; not used with a rig.
 
     Raises
     ------
@@ -79,7 +83,7 @@ def find_run(paths: Sequence[Path], rig: Rig | None = None) -> Run:
     logs = with_records or logs[:1]
     return Run(
         logs=tuple(logs),
-        rig=rig or _rig_of(logs[-1]),
+        rig=rig or _rig_of(logs[-1], overrides),
         start_ns=round(logs[0].start_s * 1e9) if with_records else 0,
         end_ns=round(max(log.end_s for log in logs) * 1e9) if with_records else 0,
     )
@@ -115,11 +119,12 @@ def _controllers_of(log: LogInfo) -> list[str]:
     return overrides
 
 
-def _rig_of(log: LogInfo) -> Rig:
+def _rig_of(log: LogInfo, overrides: Sequence[str]) -> Rig:
     _identity(log)
     try:
         text = log.metadata["rig"]["json"]
-        return rig_from_log(text, f"{log.path}: rig file in it", _controllers_of(log))
+        changes = [*_controllers_of(log), *overrides]
+        return rig_from_log(text, f"{log.path}: rig file in it", changes)
     except KeyError:
         msg = f"{log.path}: has no rig file in it; give one with --rig"
         raise LogError(msg) from None

@@ -50,6 +50,15 @@ def test_a_run_of_several_files_is_one_and_what_two_have_counts_once(halves, hel
     assert found.gathered.lost == 3
 
 
+def test_values_of_the_logs_own_rig_can_be_replaced(halves, held, rig):
+    run = find_run([held[1]], overrides=["loops.right.requirement_px=0.2"])
+
+    assert run.rig.stellar_loops["right"].requirement_px == 0.2
+    assert run.rig.stellar_loops["right"].fsm == rig.stellar_loops["right"].fsm
+    with pytest.raises(ConfigError, match=r"^--set: loops\.right\.fsm\.nonsense[^;]*$"):
+        find_run([held[1]], overrides=["loops.right.fsm.nonsense=1"])
+
+
 def test_a_folder_is_its_newest_run(halves, rig):
     other = halves / "older.mcap"
     info = run_info(rig, "simulated", now_s=-5000.0, designs=designs_of(rig))

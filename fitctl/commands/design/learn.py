@@ -33,7 +33,7 @@ def learn(
     LogError
         If the log cannot be read.
     """
-    run = find_run(logs, rig_of(rig, overrides) if rig or overrides else None)
+    run = find_run(logs, rig_of(rig, overrides) if rig else None, overrides or ())
     require_loop("design learn", run.rig, loop)
     with solving("design learn", loop):
         found = _advice(run, loop)

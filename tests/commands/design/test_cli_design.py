@@ -2,14 +2,20 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 from samples.learner_reports import LINE, PAPER
+from samples.log_samples import filled
 
 from fitctl.cli import main
+from fitctl.config import load_rig
 from fitctl.controllers.design.files import save_design
 from fitctl.controllers.design.margins import design_with_margins
+from fitctl.daemon.run import run_info
+from fitctl.logging.records import Tick
+from fitctl.logging.writer import LogWriter
 
 FLIGHT = [
     *("--set", "camera.frame_rate_hz=500.0"),
@@ -213,6 +219,22 @@ def test_what_cannot_be_is_one_line_and_status_2(design, arguments, said):
 
 
 # ---------------------------------------------------------------- learn; test_docs.py learns from a whole log
+
+
+def test_learning_with_a_replaced_value_has_the_rest_of_the_logs_rig(design, tmp_path):
+    """The loops of the shipped rig are others: with that rig, there would be no loop "left"."""
+    rig = load_rig(Path("rigs/fit-testbed.toml"))
+    with LogWriter(tmp_path / "night.mcap", rig.logging) as log:
+        log.write(run_info(rig, "", 0.0, designs={}), 1000.0)
+        log.write(filled(Tick, loop="left"), 1000.0)
+
+    status, _, err = design(
+        *("learn", tmp_path / "night.mcap", "--loop", "left"),
+        *("--set", "loops.left.requirement_px=0.2"),
+    )
+
+    assert status == 2
+    assert "learn: the longest piece in VERNIER is 0 s" in err
 
 
 @pytest.mark.parametrize(
