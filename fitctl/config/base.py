@@ -21,6 +21,22 @@ class ConfigError(Exception):
 _NAME = re.compile(r"[a-z][a-z0-9_-]{0,31}")
 
 
+# Where pydantic has a type of Python, and a rig file has another word.
+_MUST_BE = {
+    "model_type": "must be a table",
+    "dict_type": "must be a table",
+    "list_type": "must be a list",
+    "tuple_type": "must be a list",
+    "bool_type": "must be true or false",
+}
+
+
+def must_be(problem: Mapping[str, Any]) -> str:
+    """What a value must be, of one problem that pydantic found with it."""
+    text = str(problem["msg"]).removeprefix("Value error, ")
+    return _MUST_BE.get(problem["type"]) or text.replace("Input should be", "must be")
+
+
 def is_name(text: str) -> bool:
     """Whether a rig file may give something this name: one that is safe in file names, topics and pages."""
     return _NAME.fullmatch(text) is not None

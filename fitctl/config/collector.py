@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
-from fitctl.config.base import ConfigError, Finite, Name, NonNegative, Positive, Settings
+from fitctl.config.base import ConfigError, Finite, Name, NonNegative, Positive, Settings, must_be
 from fitctl.config.devices import C887Device
 
 Vector = Annotated[list[Finite], Field(min_length=3, max_length=3)]
@@ -117,9 +117,9 @@ class CollectorMotion(Settings):
             return CollectorMotion.model_validate(self.model_dump() | dict(values))
         except ValidationError as error:
             wrong = [
-                f"{key}: {each['msg'].replace('Input should be', 'must be')} (is {each['input']!r})"
+                f"{key}: {must_be(each)} (is {each['input']!r})"
                 if (key := ".".join(map(str, each["loc"])))
-                else each["msg"].removeprefix("Value error, ")
+                else must_be(each)
                 for each in error.errors()
             ]
             raise ConfigError("; ".join(wrong)) from None

@@ -11,7 +11,7 @@ from typing import Annotated, Any, NamedTuple, get_args, get_origin
 
 from pydantic import ValidationError
 
-from fitctl.config.base import METROLOGY, STELLAR, ConfigError, Settings
+from fitctl.config.base import METROLOGY, STELLAR, ConfigError, Settings, must_be
 from fitctl.config.checks import rig_conflicts
 from fitctl.config.conflict import Conflict, Conflicts
 from fitctl.config.devices import DEVICE_BY_TAG, DEVICE_TABLES
@@ -398,8 +398,7 @@ def _said(problem: Any, location: list[str], *, missing: bool) -> str:
         return f"unknown key{hint} (allowed here: {', '.join(allowed)})"
     if missing:
         return "is missing; a rig file that fitctl init writes has every key with its unit"
-    message = str(problem["msg"])
-    message = message.removeprefix("Value error, ").replace("Input should be", "must be")
+    message = must_be(problem)
     given = problem.get("input")
     is_value = isinstance(given, str | int | float | list)
     now = RENAMED_ACTIONS.get(str(given)) if location[-1:] == ["action"] else None

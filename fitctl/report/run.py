@@ -47,9 +47,7 @@ class Run(NamedTuple):
         return self.logs[-1].metadata
 
 
-def find_run(
-    paths: Sequence[Path], rig: Rig | None = None, overrides: Sequence[str] = ()
-) -> Run:
+def find_run(paths: Sequence[Path], rig: Rig | None = None, overrides: Sequence[str] = ()) -> Run:
     """The run that files, or the newest run that a folder holds.
 
     Parameters

@@ -10,7 +10,7 @@ from typing import Any, get_args
 from pydantic import ValidationError
 
 from fitctl.config import ConfigError, Rig
-from fitctl.config.base import Settings
+from fitctl.config.base import Settings, must_be
 from fitctl.config.reading import parse_override
 from fitctl.sequences.behaviours.table import problems
 from fitctl.sequences.files import read_document, read_table, shipped_sequences
@@ -185,7 +185,7 @@ def _mistake(where: str, kind: type[Settings], key: str, problem: Mapping[str, A
         case _:
             given = problem.get("input")
             shown = f" (is {given!r})" if isinstance(given, str | int | float) else ""
-            message = problem["msg"].replace("Input should be", "must be") + shown
+            message = must_be(problem) + shown
             mistake = f"{key}: {message}" if key else message
             if isinstance(given, str) and (key, given) in RENAMED_VALUES:
                 mistake += f"; {given} is now {RENAMED_VALUES[key, given]}"
