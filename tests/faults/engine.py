@@ -6,7 +6,7 @@ from itertools import pairwise
 
 from stalls import stalls
 
-from .entry import HOLDS, SEARCHES, STAYED, WAITS
+from .entries.entry import HOLDS, SEARCHES, STAYED, WAITS
 from .strikes import strike
 from .watched import modes_of
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from documents import ROOT, table
 
-from .catalogue import GROUPS
-from .configuration import WRONG
-from .entry import HOLDS, STAYED, WAITS
+from .entries.catalogue import GROUPS
+from .entries.configuration import WRONG
+from .entries.entry import HOLDS, STAYED, WAITS
 
 DOCS = ROOT / "docs"
 TOTALS = DOCS / "reliability.md"

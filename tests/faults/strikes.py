@@ -11,7 +11,7 @@ from fitctl.messages.commands import Jog, MoveCollector, Reset, Shutdown, Stop
 from fitctl.mocks.bench import ClearFaults, SetFault
 from fitctl.model.optics import scales
 
-from .commands import FLOOD, FLOODED, SENT, answers
+from .entries.commands import FLOOD, FLOODED, SENT, answers
 
 SLOW_S = 0.015  # stopped for so long, then running for so long: half of its time
 ENDS_WITHIN_S = 10.0

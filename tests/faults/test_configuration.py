@@ -5,7 +5,7 @@ import pytest
 from fitctl.cli import main
 from fitctl.config import default_rig_path
 
-from .configuration import WRONG
+from .entries.configuration import WRONG
 
 
 def refused(arguments, capsys):

@@ -2,10 +2,10 @@
 
 import pytest
 
-from . import testbed
-from .catalogue import INSTRUMENTS
 from .conftest import RESULTS
 from .engine import run
+from .entries import testbed
+from .entries.catalogue import INSTRUMENTS
 from .setups import SETUPS
 
 pytestmark = [pytest.mark.fault, pytest.mark.timeout(200)]

@@ -6,7 +6,7 @@ import pytest
 from stalls import Stalls
 
 from .engine import check_still, stood_still, ticks_went_on
-from .entry import Entry
+from .entries.entry import Entry
 from .watched import Place
 
 ENTRY = Entry("right.drive", "drop", ("SAFE",))

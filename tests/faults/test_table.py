@@ -7,9 +7,9 @@ from documents import between
 
 from fitctl.commands.shared.fault_kinds import kinds
 
-from . import devices, testbed
-from .catalogue import GROUPS
-from .configuration import WRONG
+from .entries import devices, testbed
+from .entries.catalogue import GROUPS
+from .entries.configuration import WRONG
 from .report import MEASURED, promised, wrong_table
 
 # Which device each table of kinds is for.
