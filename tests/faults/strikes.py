@@ -11,7 +11,7 @@ from fitctl.messages.commands import Jog, MoveCollector, Reset, Shutdown, Stop
 from fitctl.mocks.bench import ClearFaults, SetFault
 from fitctl.model.optics import scales
 
-from .entries.commands import FLOOD, FLOODED, SENT, answers
+from .entries.commands import ALONE, BATCH, FASTER, FLOOD, FLOODED, SENT, answers
 
 SLOW_S = 0.015  # stopped for so long, then running for so long: half of its time
 ENDS_WITHIN_S = 10.0
@@ -280,9 +280,20 @@ def command(rig, entry):
     if entry.how in SENT:
         rig.heard += answers(rig.sockets, SENT[entry.how][0])
     else:
-        count = sum(1 for _ in answers(rig.sockets, FLOODED, FLOOD))
-        rig.heard.append(f"{count} answers")
+        rig.heard.append(flooded(rig.sockets))
     yield
+
+
+def flooded(sockets):
+    """How many answers a flood got, and how fast, beside commands that each wait for the one before."""
+    each_s = []
+    for times, ahead in ((ALONE, 1), (FLOOD, BATCH)):
+        started_s = time.monotonic()
+        count = sum(1 for _ in answers(sockets, FLOODED, times, ahead))
+        each_s.append((time.monotonic() - started_s) / max(count, 1))
+    faster = each_s[0] / each_s[1]
+    speed = f"at least {FASTER}" if faster >= FASTER else f"only {faster:.1f}"
+    return f"{count} answers, {speed} times as fast as one by one"
 
 
 @contextmanager
