@@ -33,7 +33,7 @@ def figure_7(rig: Rig, loop_name: str, seed: int, folder: Path, minutes: int) ->
         rig, loop_name, "airpath", plan(rig, loop_name), seed, lambda _part: None
     )
     tracks = track_spots(
-        frames_of_records(records, loop_name), rig.camera, rig.stellar_loops[loop_name]
+        frames_of_records(records, loop_name, rig.camera), rig.camera, rig.stellar_loops[loop_name]
     )
     found = analyse(rig, loop_name, tracks)
     truth, _ = rig.mock_parts()

@@ -116,13 +116,17 @@ EXPERIMENTS: dict[str, Identification] = {
     "delay": _of_stages("delay", delay.plan, delay.analyse),
     "airpath": Identification(
         airpath.plan,
-        lambda rig, loop, path: _air_path(rig, loop, frames_of_log(path, loop)),
-        lambda rig, loop, records: _air_path(rig, loop, frames_of_records(records, loop)),
+        lambda rig, loop, path: _air_path(rig, loop, frames_of_log(path, loop, rig.camera)),
+        lambda rig, loop, records: _air_path(
+            rig, loop, frames_of_records(records, loop, rig.camera)
+        ),
     ),
     "spot": Identification(
         spot.plan,
-        lambda rig, loop, path: spot.analyse(rig, loop, frames_of_log(path, loop)),
-        lambda rig, loop, records: spot.analyse(rig, loop, frames_of_records(records, loop)),
+        lambda rig, loop, path: spot.analyse(rig, loop, frames_of_log(path, loop, rig.camera)),
+        lambda rig, loop, records: spot.analyse(
+            rig, loop, frames_of_records(records, loop, rig.camera)
+        ),
     ),
     "response": Identification(None, _response_from_file, None),
     "feedforward": _of_step(feedforward.STEP, Tick, feedforward.analyse),

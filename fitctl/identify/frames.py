@@ -120,13 +120,13 @@ def track_spots(frames: Iterable[TimedImage], camera: Camera, loop: Loop) -> Tra
     )
 
 
-def frames_of_log(path: Path, loop_name: str) -> Iterator[TimedImage]:
+def frames_of_log(path: Path, loop_name: str, camera: Camera) -> Iterator[TimedImage]:
     """Frames of a log, as :func:`frames_of_records`.
 
     Raises
     ------
     IdentifyError
-        If the log has no frames, none from stages at rest, or one whose size does not fit its height.
+        If the log has no frames, none from stages at rest, or one of another size than the camera's.
     LogError
         If the log cannot be read, has no ticks of this loop, or does not say what its times are.
     """
@@ -141,25 +141,25 @@ def frames_of_log(path: Path, loop_name: str) -> Iterator[TimedImage]:
         time_s = entry.publish_time_ns / 1e9 - offset_s
         if start_s - _CLOCK_S <= time_s <= end_s + _CLOCK_S:
             raw: Any = entry.message  # RawImage
-            yield TimedImage(time_s, _image(raw.data, raw.height, str(path)))
+            yield TimedImage(time_s, _image(raw.data, raw.height, camera))
 
 
-def frames_of_records(records: Iterable[AnyRecord], loop_name: str) -> Iterator[TimedImage]:
+def frames_of_records(
+    records: Iterable[AnyRecord], loop_name: str, camera: Camera
+) -> Iterator[TimedImage]:
     """Frames from the longest stretch in which the loop's stages were commanded to stand still.
 
     Raises
     ------
     IdentifyError
-        If there is no such stretch, or a frame's size does not fit its height.
+        If there is no such stretch, or a frame's size is not the camera's.
     """
     kept = list(records)
     ticks = [record for record in kept if isinstance(record, Tick) and record.loop == loop_name]
     start_s, end_s = longest_rest(tick_columns(ticks))
     for record in kept:
         if isinstance(record, FrameRecord) and start_s <= record.time_s <= end_s:
-            yield TimedImage(
-                record.time_s, _image(record.data, record.height_px, f"loop {loop_name}")
-            )
+            yield TimedImage(record.time_s, _image(record.data, record.height_px, camera))
 
 
 def longest_rest(ticks: dict[str, NDArray[Any]]) -> tuple[float, float]:
@@ -193,14 +193,14 @@ def longest_rest(ticks: dict[str, NDArray[Any]]) -> tuple[float, float]:
     return float(still_s[0]), float(still_s[-1])
 
 
-def _image(data: bytes, height_px: int, of: str) -> NDArray[np.uint16]:
-    if not data or height_px < 1 or len(data) % (2 * height_px):
+def _image(data: bytes, height_px: int, camera: Camera) -> NDArray[np.uint16]:
+    if height_px != camera.height_px or len(data) != 2 * camera.width_px * camera.height_px:
         msg = (
-            f"{of}: a frame has {len(data)} bytes for {height_px} rows; expected rows of equal length, two "
-            "bytes a pixel; the record is damaged or not fitctl's: record again"
+            f"a frame has {len(data)} bytes in {height_px} rows; expected {camera.width_px} x "
+            f"{camera.height_px} pixels of two bytes, as in the rig file; name the rig of the log with --rig"
         )
         raise IdentifyError(msg)
-    return np.frombuffer(data, dtype="<u2").reshape(height_px, -1)
+    return np.frombuffer(data, dtype="<u2").reshape(camera.height_px, camera.width_px)
 
 
 def _on_grid(time_s: Floats, px: Floats, flux_dn: Floats, period_s: float) -> Tracks:

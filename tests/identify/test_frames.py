@@ -172,9 +172,9 @@ def test_over_a_link_the_siderostat_may_move_in_open_loop():
         longest_rest(tick_columns(ticks[:100]))
 
 
-def test_stages_that_always_move_give_no_rest():
+def test_stages_that_always_move_give_no_rest(rig):
     with pytest.raises(IdentifyError, match="never stood still"):
-        list(frames_of_records(still_from(0, 0), "right"))
+        list(frames_of_records(still_from(0, 0), "right", rig.camera))
 
 
 def test_frames_of_records_and_of_their_log_are_the_same(rig, tmp_path):
@@ -195,7 +195,10 @@ def test_frames_of_records_and_of_their_log_are_the_same(rig, tmp_path):
         log.write(RUN_INFO, 0.0)
         for record in records:
             log.write(record, 0.0)
-    kept, read = list(frames_of_records(records, "right")), list(frames_of_log(path, "right"))
+    kept, read = (
+        list(frames_of_records(records, "right", rig.camera)),
+        list(frames_of_log(path, "right", rig.camera)),
+    )
     assert 80 < len(kept) < 100
     assert [frame.time_s for frame in read] == pytest.approx(
         [frame.time_s for frame in kept], abs=1e-6
@@ -203,8 +206,8 @@ def test_frames_of_records_and_of_their_log_are_the_same(rig, tmp_path):
     assert all(np.array_equal(a.image, b.image) for a, b in zip(kept, read, strict=True))
 
 
-@pytest.mark.parametrize(("size", "height_px"), [(3200, 39), (3, 1), (0, 40), (0, 0)])
-def test_a_frame_whose_size_does_not_fit_its_height_is_refused(size, height_px):
+@pytest.mark.parametrize(("size", "height_px"), [(3200, 39), (3, 1), (0, 40), (0, 0), (6400, 40)])
+def test_a_frame_of_another_size_than_the_cameras_is_refused(rig, size, height_px):
     frame = FrameRecord(
         time_s=103.0,
         camera="focal plane",
@@ -213,8 +216,8 @@ def test_a_frame_whose_size_does_not_fit_its_height_is_refused(size, height_px):
         height_px=height_px,
         data=bytes(size),
     )
-    with pytest.raises(IdentifyError, match=f"{size} bytes for {height_px} rows; expected"):
-        list(frames_of_records([*still_from(100, 200, ticks=250), frame], "right"))
+    with pytest.raises(IdentifyError, match=f"{size} bytes in {height_px} rows; expected 40 x 40"):
+        list(frames_of_records([*still_from(100, 200, ticks=250), frame], "right", rig.camera))
 
 
 def test_a_log_without_frames_is_refused(rig, tmp_path):
@@ -224,7 +227,7 @@ def test_a_log_without_frames_is_refused(rig, tmp_path):
         for made in still_from(100, 200, ticks=250):
             log.write(made, 0.0)
     with pytest.raises(IdentifyError, match="has no frames"):
-        list(frames_of_log(path, "right"))
+        list(frames_of_log(path, "right", rig.camera))
 
 
 def test_a_log_that_does_not_say_what_its_times_are_is_refused(rig, tmp_path):
@@ -233,7 +236,7 @@ def test_a_log_that_does_not_say_what_its_times_are_is_refused(rig, tmp_path):
         for made in [*still_from(100, 200, ticks=250), filled(FrameRecord, width_px=40)]:
             log.write(made, 0.0)
     with pytest.raises(LogError, match=r"run\.mcap: has no start of its run"):
-        list(frames_of_log(path, "right"))
+        list(frames_of_log(path, "right", rig.camera))
 
 
 def test_frames_that_never_show_all_spots_are_refused(rig, loop):

@@ -1,6 +1,7 @@
 """No text of a log becomes a path: a log comes from whoever wrote it."""
 
 import json
+import math
 import sys
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from samples.learner_reports import report
-from samples.log_samples import RUN_INFO, frame, tick, write_log
+from samples.log_samples import RUN_INFO, filled, frame, tick, write_log
 from samples.replay_courses import hold_a_star
 
 from fitctl.cli import main
@@ -21,7 +22,7 @@ from fitctl.logging import schemas
 from fitctl.logging.errors import LogError
 from fitctl.logging.exporting import export
 from fitctl.logging.reading import log_info
-from fitctl.logging.records import ControllerChange, Event, Tick
+from fitctl.logging.records import ControllerChange, DevicesOpened, Event, Tick
 from fitctl.logging.schemas import MESSAGES
 from fitctl.messages.command_table import command_record
 from fitctl.messages.commands import Reply, SetController
@@ -192,6 +193,25 @@ def test_a_record_of_another_loop_than_its_topic_s_is_refused(tmp_path, monkeypa
 
     refusal = r"a\.mcap: /fit/right/tick is not as fitctl records it: .*'other'; expected 'right'"
     with pytest.raises(LogError, match=refusal):
+        list(read_steps(log_info(path), load_rig(default_rig_path())))
+
+
+@pytest.mark.parametrize("value", [math.inf, -1e15, 1e308])
+@pytest.mark.parametrize("name", ["mid_exposure_s", "compute_s"])
+def test_numbers_that_no_instrument_has_are_refused(tmp_path, name, value):
+    path = write_log(tmp_path / "a.mcap", [RUN_INFO, tick(1, **{name: value}), frame(1)])
+
+    refusal = rf"a\.mcap: /fit/right/tick is not as fitctl records it: {name} is "
+    with pytest.raises(LogError, match=refusal):
+        list(read_steps(log_info(path), load_rig(default_rig_path())))
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -1e15])
+def test_outputs_that_no_d_a_has_are_refused(tmp_path, value):
+    opened = filled(DevicesOpened, loop="right", error="", stack2_v=value)
+    path = write_log(tmp_path / "a.mcap", [RUN_INFO, opened, tick(1), frame(1)])
+
+    with pytest.raises(LogError, match=r"a\.mcap: .* is not as fitctl records it: stack2_v is "):
         list(read_steps(log_info(path), load_rig(default_rig_path())))
 
 

@@ -12,6 +12,7 @@ import pytest
 from google.protobuf.descriptor_pool import DescriptorPool
 from mcap.writer import Writer
 from mcap_protobuf.writer import Writer as McapWriter
+from samples.log_samples import filled
 from samples.logged_simulation import designs_of
 from samples.report_samples import record
 
@@ -164,6 +165,18 @@ def test_records_of_another_shape_are_refused_in_one_line(rig, tmp_path, kind, t
         gather(find_run([path]))
 
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("value", [np.inf, -1e15])
+def test_a_time_that_is_none_is_refused(rig, tmp_path, value):
+    path = tmp_path / "odd.mcap"
+    info = run_info(rig, "simulated", now_s=0.0, designs=designs_of(rig))
+    with LogWriter(path, rig.logging) as log:
+        log.write(info, 1e9)
+        log.write(filled(Tick, loop="right", mid_exposure_s=value), 1e9)
+
+    with pytest.raises(LogError, match=r"odd\.mcap: mid_exposure_s of its ticks is no time"):
+        gather(find_run([path]))
 
 
 def test_more_records_than_bytes_in_a_file_are_refused(rig, tmp_path):
