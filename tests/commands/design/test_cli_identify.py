@@ -114,8 +114,10 @@ def test_an_experiment_during_which_another_log_began_is_read_from_both(rig, tmp
     for path, part in zip(paths, (records[:middle], records[middle:]), strict=True):
         with LogWriter(path, rig.logging) as log:
             log.write(run_info(rig, "", 0.0, designs={}), WALL_S)
+            newest_s = 0.0  # a recorder's log times never go back
             for record in part:
-                log.write(record, WALL_S + record.time_s)
+                newest_s = max(newest_s, record.time_s)
+                log.write(record, WALL_S + newest_s)
 
     found = EXPERIMENTS["delay"].from_logs(rig, "right", paths)
 
