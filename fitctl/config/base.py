@@ -18,9 +18,6 @@ class ConfigError(Exception):
     """A rig file that cannot be used; ``str()`` gives one line for each thing that is wrong."""
 
 
-_NAME = re.compile(r"[a-z][a-z0-9_-]{0,31}")
-
-
 # Where pydantic has a type of Python, and a rig file has another word.
 _MUST_BE = {
     "model_type": "must be a table",
@@ -35,6 +32,9 @@ def must_be(problem: Mapping[str, Any]) -> str:
     """What a value must be, of one problem that pydantic found with it."""
     text = str(problem["msg"]).removeprefix("Value error, ")
     return _MUST_BE.get(problem["type"]) or text.replace("Input should be", "must be")
+
+
+_NAME = re.compile(r"[a-z][a-z0-9_-]{0,31}")
 
 
 def is_name(text: str) -> bool:

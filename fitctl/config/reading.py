@@ -268,13 +268,9 @@ def rig_from_log(text: str, origin: str, overrides: Sequence[str] = ()) -> Rig:
     except ConfigError as error:
         first, *more = str(error).splitlines()
         also = f" ({len(more)} more)" if more else ""
-        if first.startswith("--set:"):
-            raise ConfigError(first + also) from None
-        msg = (
-            f"{first}{also}; give a rig file of this fitctl with --rig ('fitctl rig upgrade' makes one of an "
-            "older file)"
-        )
-        raise ConfigError(msg) from None
+        hint = "; give a rig file of this fitctl with --rig ('fitctl rig upgrade' makes one of an older file)"
+        is_own = first.startswith(f"{_SET}:")  # no other rig file would mend it
+        raise ConfigError(first + also + ("" if is_own else hint)) from None
 
 
 def _rig_in_log(text: str, origin: str, overrides: Sequence[str]) -> Rig:

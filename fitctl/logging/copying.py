@@ -23,14 +23,11 @@ from mcap.writer import Writer
 
 from fitctl.files import replaced_whole
 from fitctl.logging.errors import LogError
-from fitctl.logging.files import DAMAGE, Described, opened
+from fitctl.logging.files import COPY, DAMAGE, Described, opened
 from fitctl.logging.folder import in_use
 
 # A recorder that dies leaves a quarter of logging.queue_records unconfirmed, and that is a million at the most.
 _REMEMBERED = 250_000
-
-COPY = "copy"
-"""Name of the metadata that a log has which was made from others."""
 
 
 class _Copied(NamedTuple):

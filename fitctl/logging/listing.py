@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fitctl.logging.copying import COPY
 from fitctl.logging.errors import LogError
+from fitctl.logging.files import COPY
 from fitctl.logging.reading import LogInfo, log_info
 
 

@@ -25,7 +25,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from numpy.typing import NDArray
 
 from fitctl.logging.errors import LogError
-from fitctl.logging.files import Described, opened, up_to_the_tear
+from fitctl.logging.files import MOST, Described, opened, up_to_the_tear
 from fitctl.logging.indexed import IndexedReader
 from fitctl.logging.records import Tick
 from fitctl.logging.schemas import TOPICS
@@ -42,7 +42,6 @@ _COLUMNS: dict[int, tuple[str, Any]] = {
 }
 _MOST_CHARACTERS = 200_000_000  # of a column of texts, of four bytes each
 Columns = dict[str, NDArray[Any]]
-_MOST_CLOCK_S = 1e15
 HEADER = ("log_time_ns", "publish_time_ns", "sequence")
 """The columns that every topic has."""
 
@@ -345,7 +344,7 @@ def clock_of(path: Path, metadata: Mapping[str, Mapping[str, str]]) -> LogClock:
         found = LogClock(*(float(clock[name]) for name in LogClock._fields))
     except (KeyError, ValueError):
         found = LogClock(math.nan, math.nan)
-    if not all(abs(value) < _MOST_CLOCK_S for value in found):
+    if not all(abs(value) < MOST for value in found):
         msg = f"{path}: has no start of its run (metadata clock); name a log that fitctl recorded"
         raise LogError(msg)
     return found

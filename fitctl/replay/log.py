@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 from fitctl.config import Rig
 from fitctl.logging.copying import merge
 from fitctl.logging.errors import LogError
+from fitctl.logging.files import MOST
 from fitctl.logging.reading import (
     LogInfo,
     clock_of,
@@ -63,7 +64,6 @@ _TICKS = {Tick, MetrologyTick}
 KINDS: set[Any] = _BEGIN | _BEFORE_TICK | _AT_THE_END | _TICKS | {FrameRecord}
 _TIMES = ("mid_exposure_s", "compute_s", "requested_s")  # of ticks
 _STACKS = ("stack1_v", "stack2_v", "stack3_v")
-_MOST = 1e15  # of these numbers
 # The newest field that a replay needs of each kind of tick, and what a log without it lacks.
 _NEEDED = {
     Tick: ("fsm_written_s", "have neither commands nor when voltages took effect"),
@@ -239,7 +239,7 @@ def _records(info: LogInfo, rig: Rig) -> Iterator[tuple[Logged, int]]:
                 f"expected {loops[entry.topic]!r}; name a log that fitctl recorded"
             )
             raise LogError(msg)
-        _insist_on_numbers(info, entry.topic, Logged(kind, message), rig)
+        _insist_on_numbers(info, entry.topic, kind, message, rig)
         if is_first:
             _insist_on_start(info, entry.publish_time_ns)
             is_first = False
@@ -263,16 +263,16 @@ def _is_over(step: LoggedStep, record: Logged, powered: bool) -> bool:
     return record.kind in _BEGIN
 
 
-def _insist_on_numbers(info: LogInfo, topic: str, record: Logged, rig: Rig) -> None:
+def _insist_on_numbers(info: LogInfo, topic: str, kind: Any, message: Any, rig: Rig) -> None:
     """Refuse times that cannot be counted from, and outputs that no D/A has."""
-    message = record.message
-    names: Sequence[str] = _TIMES if record.kind in _TICKS else ()
-    if record.kind is DevicesOpened and not message.error and message.loop in rig.stellar_loops:
+    names: Sequence[str] = _TIMES if kind in _TICKS else ()
+    has_outputs = kind is DevicesOpened and not message.error and message.loop in rig.stellar_loops
+    if has_outputs:
         names = _STACKS
     for name in names:
         value = getattr(message, name, 0.0)
         # The NaN of a time stands for what there was not.
-        if abs(value) >= _MOST or (names is _STACKS and math.isnan(value)):
+        if abs(value) >= MOST or (has_outputs and math.isnan(value)):
             msg = (
                 f"{info.path}: {topic} is not as fitctl records it: {name} is {value:g}; name a log that "
                 "fitctl recorded"

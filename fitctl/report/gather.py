@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.logging.errors import LogError
-from fitctl.logging.files import MEND
+from fitctl.logging.files import MEND, MOST
 from fitctl.logging.reading import HEADER, Columns, column_blocks
 from fitctl.logging.records import (
     ControllerChange,
@@ -44,7 +44,6 @@ _KINDS: dict[Any, str] = {
     RecorderStatus: "recorder",
 }
 _NUMBERS, _TEXT = "fib", "U"  # as numpy names kinds of values
-_MOST_S = 1e15  # of a time
 _FIELDS: dict[str, dict[str, str]] = {
     name: {
         one.name: _NUMBERS if one.type in (int, float) else _TEXT
@@ -249,7 +248,7 @@ def _fill(room: Columns, at: int, columns: Columns, time_s: NDArray[np.float64],
     _require(columns, dict.fromkeys(room, _NUMBERS), LATER_FIELDS, "ticks", path)
     block = columns | {"time_s": time_s}
     if "mid_exposure_s" in room:
-        if np.any(np.abs(columns["mid_exposure_s"]) >= _MOST_S):
+        if np.any(np.abs(columns["mid_exposure_s"]) >= MOST):
             msg = f"{path}: mid_exposure_s of its ticks is no time; it was not recorded by fitctl"
             raise LogError(msg)
         block["mid_exposure_s"] = columns["mid_exposure_s"] + (time_s - columns["time_s"])

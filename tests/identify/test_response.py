@@ -158,7 +158,9 @@ def test_csv_reads_as_npz_does(rig, records, tmp_path):
 def test_a_file_that_is_no_bench_record_is_refused_with_what_is_expected(rig, tmp_path, text):
     path = tmp_path / "bench.csv"
     path.write_text(text)
-    with pytest.raises(IdentifyError, match="expected"):
+    with pytest.raises(
+        IdentifyError, match=r"expected (NPZ or CSV with time_s|samples at a constant rate)"
+    ):
         response.read_bench(path, rig.loops["right"].fsm)
 
 

@@ -18,8 +18,9 @@ from samples.log_samples import (
     write_log,
 )
 
-from fitctl.logging.copying import COPY, cut, merge, recover
+from fitctl.logging.copying import cut, merge, recover
 from fitctl.logging.errors import LogError
+from fitctl.logging.files import COPY
 from fitctl.logging.reading import log_info, read_records
 from fitctl.logging.verifying import verify
 from fitctl.logging.writer import LogWriter

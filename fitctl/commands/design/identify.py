@@ -127,7 +127,8 @@ def identify(
         _write(plot_path, lambda: finding.plot(plot_path))
         text = fragment_text(by, settings, finding.lines(), finding.fragment())
     except (IdentifyError, ConnectionError, demos.DemoError) as error:
-        say(f"identify {what}: {f'{log}: ' if log else ''}{error}", err=True)
+        named = f"{log}: " if log else ""
+        say(f"identify {what}: {named}{error}", err=True)
         raise typer.Exit(UNUSABLE if log else FAILED) from None
     _write(fragment_path, lambda: write_whole(fragment_path, text.encode()))
     if as_json:

@@ -17,6 +17,7 @@ import msgspec
 
 from fitctl.config import is_name
 from fitctl.logging.errors import LogError
+from fitctl.logging.files import MOST
 from fitctl.logging.reading import LogMessage, clock_of
 from fitctl.logging.records import (
     CAMERA,
@@ -50,7 +51,6 @@ MOST_PIXELS = 4_000_000
 MOST_TEXT = 4_000
 MOST_STATE_BYTES = 1 << 20
 EVENT_BYTES = 4 << 30  # of chunks that have an event, unpacked once when the log is opened
-BOUND = 1e15  # of every number
 SMALLEST, LARGEST = 1e-6, 1e5  # of a loop's requirement, scale and limits, which panels divide by
 SMALLEST_WAVELENGTH_M = 1e-9  # of light; panels divide by it
 _OF_LOOP: tuple[type[AnyRecord], ...] = (
@@ -264,7 +264,7 @@ def _changed(loop: LoopState, change: ModeChange | None) -> LoopState:
 
 
 def _is_bounded(value: float) -> bool:
-    return math.isnan(value) or -BOUND < value < BOUND
+    return math.isnan(value) or abs(value) < MOST
 
 
 def _frame_of(message: Any, time_s: float, number: int) -> FrameRecord | None:
