@@ -124,6 +124,7 @@ class MetrologyLoop(Loop):
         self._motor_sky = settings.siderostat.sky_rad_per_motor_rad
         self._turn = rotation(settings.siderostat.rotation_deg)
         self._pull_in_rad_s = PULL_IN * settings.siderostat.velocity_limit_rad_s * self._motor_sky
+        self._hold_most_rad = hold_most_rad(settings)
         self._late_s = rig.camera.frame_delay_s + rig.supervisor.late_tick_s
         self._period_s = rig.camera.period_s
         self._sky_arcsec_per_px = ARCSEC_PER_RAD / sky_px_per_rad(rig)
@@ -265,11 +266,15 @@ class MetrologyLoop(Loop):
         if error_rad is not None:
             step_rad = self.hold.pull_in(error_rad, duration_s)
             # No faster than the siderostat follows, or the set-point would run away from it.
-            most_rad = self._pull_in_rad_s * duration_s
-            self._turn_beam(step_rad * min(1.0, most_rad / max(np.abs(step_rad).max(), 1e-12)))
+            self._turn_beam(limited(step_rad, self._pull_in_rad_s * duration_s))
 
     def _hold_beam(self, sensed: _Sensed, duration_s: float) -> None:
-        self._turn_beam(self.hold.step(self._error_rad(sensed.beam), duration_s))
+        error_rad = self._error_rad(sensed.beam)
+        if error_rad is not None:
+            # What is farther off ends the hold. Until then it counts no more than what would not: a photodiode
+            # that comes loose drives neither this siderostat nor that of a stellar loop to its travel's end.
+            error_rad = limited(error_rad, self._hold_most_rad)
+        self._turn_beam(self.hold.step(error_rad, duration_s))
 
     def _error_rad(self, beam: Beam | None) -> Floats | None:
         if beam is None or beam.state is BeamState.LOST:
@@ -389,6 +394,16 @@ class MetrologyLoop(Loop):
             decide_s=self._decided_s - self._sensed_s,
             requested_s=self._requested_s,
         )
+
+
+def limited(both: Floats, most: float) -> Floats:
+    """A pair, shape (2,), in the same direction, with no axis above `most`."""
+    return both * min(1.0, most / max(np.abs(both).max(), 1e-12))
+
+
+def hold_most_rad(settings: MetrologySettings) -> float:
+    """The largest error of the beam by which it is held."""
+    return OUT_OF_REACH * settings.requirement_arcsec / ARCSEC_PER_RAD
 
 
 def metrology_loop(name: str, rig: Rig, devices: LoopDevices, journal: Journal) -> MetrologyLoop:

@@ -533,14 +533,14 @@ class StellarLoop(Loop):
         if self.mode not in TRACKING:
             link.begin()
         elif link.holds and self._search_due is None:
-            self.siderostat.move_by(link.step_rad())
+            self.siderostat.undo(link.step_rad())
 
     def _follow_sky(self, sky: Sky, now_s: float) -> None:
         """Undo what the star moves by itself, as long as it is tracked."""
         if self.mode not in TRACKING:
             sky.begin(now_s)
         elif not self.waits_for and self._search_due is None:
-            self.siderostat.move_by(sky.step_rad(now_s))
+            self.siderostat.undo(sky.step_rad(now_s))
 
     # ------------------------------------------------------------ control laws
 

@@ -9,6 +9,7 @@ from fitctl.config import Rig
 from fitctl.stages.servo import SiderostatServo
 
 Floats = NDArray[np.float64]
+_NOTHING = np.zeros(2)
 
 
 class SiderostatStage:
@@ -37,6 +38,7 @@ class SiderostatStage:
         self.servo = servo
         self.setpoint_rad = np.zeros(2)
         self.wanted_fraction = 0.0
+        self._beyond_rad = _NOTHING
         self._motor_sky_arcsec_per_rad = siderostat.sky_arcsec_per_motor_rad
         self.travel_rad = siderostat.travel_rad
 
@@ -45,18 +47,33 @@ class SiderostatStage:
         self.servo.hold(motor_rad)
         self.setpoint_rad = self.servo.setpoint_rad
         self.wanted_fraction = 0.0
+        self._beyond_rad = _NOTHING
 
     def jog(self, step_sky_arcsec: Floats) -> None:
         """Move the set-point by an angle on the sky, shape (2,)."""
         self.move_by(step_sky_arcsec / self._motor_sky_arcsec_per_rad)
 
     def move_by(self, step_rad: Floats) -> None:
-        """Move the set-point by motor angles, shape (2,)."""
-        self.move_to(self.setpoint_rad + step_rad)
+        """Move the set-point by motor angles, shape (2,); what the travel cuts off is lost."""
+        self._move(self.setpoint_rad + step_rad, self._beyond_rad)
+
+    def undo(self, step_rad: Floats) -> None:
+        """Move the set-point by motor angles, shape (2,), against what turns the star by a known angle.
+
+        What the travel's end cuts off is kept for the next call: when that turn goes back, the set-point comes
+        back to where it was.
+        """
+        wanted_rad = self.setpoint_rad + self._beyond_rad + step_rad
+        self._move(wanted_rad, _NOTHING)
+        self._beyond_rad = wanted_rad - self.setpoint_rad
 
     def move_to(self, setpoint_rad: Floats) -> None:
         """Move the set-point, shape (2,), no farther than its travel."""
-        az_rad, el_rad = setpoint_rad.tolist()
+        self._beyond_rad = _NOTHING
+        self._move(setpoint_rad, _NOTHING)
+
+    def _move(self, setpoint_rad: Floats, beyond_rad: Floats) -> None:
+        az_rad, el_rad = (setpoint_rad + beyond_rad).tolist()
         most_rad = self.travel_rad
         self.wanted_fraction = max(abs(az_rad), abs(el_rad)) / most_rad
         within = self.wanted_fraction <= 1.0

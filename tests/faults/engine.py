@@ -78,7 +78,7 @@ def attempted(rig, entry, home, stalled):
     rig.reach(home | {entry.loop: entry.mode})
     if entry.struck in PROCESSES:
         rig.process(entry.struck)  # a console is opened, a recorder may just be starting
-    hold_first(rig, entry)
+    hold_all(rig, entry)
     wait_until_over(rig, entry.says)
     deaf = entry.struck == "supervisor" and entry.how != "slowed"
     del rig.telemetry[:-1], rig.places[:], rig.heard[:]
@@ -95,13 +95,14 @@ def attempted(rig, entry, home, stalled):
     back_s = time.monotonic() - healed_s
     if entry.ends == SEARCHES:
         came_back_by_itself(rig, entry.loop, struck_s)
+    hold_all(rig, entry)  # one that waited may only now find that its star is elsewhere
     measured |= went_on(rig, entry, struck_s)
     if not entry.moves:
         stood_still(rig, entry, struck_s, deaf)
     return measured | {"back_s": round(back_s, 1)}
 
 
-def hold_first(rig, entry):
+def hold_all(rig, entry):
     """Wait until all loops hold their stars: one that has just come to VERNIER is far off, or still waits."""
     if not entry.others:
         return

@@ -384,3 +384,62 @@ def test_a_place_that_a_command_gives_is_one_with_the_link_as_it_is(held):
     )
     assert held.command(asked).accepted
     held.until(8.0, left=Mode.VERNIER)
+
+
+class LooseDiode:
+    """The photodiodes of a loop, of which one reads nothing."""
+
+    def __init__(self, photodiodes, index):
+        self._photodiodes, self._index = photodiodes, index
+        self.send_request = photodiodes.send_request
+
+    def receive(self):
+        sample = self._photodiodes.receive()
+        if sample is None:
+            return None
+        volts = [0.0 if n == self._index else volt for n, volt in enumerate(sample.volts)]
+        return sample._replace(volts=tuple(volts))
+
+
+@pytest.mark.parametrize("travel_rad", [74.0, 1.0], ids=["far from its end", "near its end"])
+def test_a_photodiode_that_comes_loose_for_a_second_turns_the_left_siderostat_little_and_costs_no_star(
+    travel_rad,
+):
+    one = Testbed().held()
+    one.run(2.0)
+    metrology, siderostat = one.loop(METROLOGY), one.loop(LEFT).siderostat
+    siderostat.travel_rad = travel_rad
+    photodiodes, before_rad = metrology._photodiodes, siderostat.setpoint_rad
+    one.records.clear()
+    metrology._photodiodes = LooseDiode(photodiodes, index=1)
+    one.run(1.0)
+    turned_rad = np.abs(siderostat.setpoint_rad - before_rad).max()
+    assert turned_rad * one.loop(LEFT).settings.siderostat.sky_arcsec_per_motor_rad < 60.0
+    metrology._photodiodes = photodiodes
+    one.until(metrology=Mode.LOCKED).run(3.0)
+    changes = [record for record in one.records if isinstance(record, ModeChange)]
+    assert [(change.loop, change.target) for change in changes] == [
+        (METROLOGY, "COARSE"),
+        (METROLOGY, "LOCKED"),
+    ]
+    assert siderostat.setpoint_rad == pytest.approx(before_rad, abs=0.2)
+    rms_px = one.rms_px(LEFT, one.clock.now_s() - 1.0)
+    assert (rms_px < one.loop(LEFT).settings.requirement_px).all()
+
+
+@pytest.mark.parametrize("amplitude_mm", [0.5, -0.5])
+def test_a_link_that_turns_beyond_the_left_siderostats_travel_and_back_leaves_it_where_it_was(
+    amplitude_mm,
+):
+    one = Testbed().held()
+    one.run(2.0)
+    siderostat = one.loop(LEFT).siderostat
+    before_rad = siderostat.setpoint_rad
+    one.swing(amplitude_mm)  # 0.6 rad: the mirror makes up for what is beyond
+    siderostat.travel_rad = np.abs(before_rad).max() + 0.1
+    farthest = 0.0
+    for _ in range(100):
+        one.run(0.02)
+        farthest = max(farthest, siderostat.wanted_fraction)
+    assert farthest > 1.3
+    assert siderostat.setpoint_rad == pytest.approx(before_rad, abs=0.2)

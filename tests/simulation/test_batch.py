@@ -405,6 +405,17 @@ def assert_same_loops(simulation, samples, run):
             ],
             id="beam out of reach and back",
         ),
+        pytest.param(
+            [
+                "collector.motion.kind=sine",
+                "collector.motion.frequency_hz=0.2",
+                "collector.motion.amplitude_mm=2.4",
+                "loops.left.siderostat.travel_sky_arcsec=40.0",
+                "loops.left.acquisition.search_radius_sky_arcsec=30.0",
+                "plant.loops.left.star_offset_sky_arcsec_max=5.0",
+            ],
+            id="beyond the left siderostat's travel and back",
+        ),
     ],
 )
 def test_all_loops_of_the_testbed_make_the_same_run(overrides):

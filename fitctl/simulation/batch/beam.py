@@ -210,6 +210,8 @@ def hold_beam(b: Any, r: Any, duration_s: float) -> None:
         part = min(1.0, most_rad / max(abs(az_rad), abs(el_rad), 1e-12))
         turn_by(b, r, az_rad * part, el_rad * part)
     elif r.mode == LOCKED and has_beam:
+        part = min(1.0, b.hold_most_rad / max(abs(az_rad), abs(el_rad), 1e-12))
+        az_rad, el_rad = az_rad * part, el_rad * part
         az_rad, r.rate_rad_s[0] = hold_step(b.hold, r.rate_rad_s[0], az_rad, duration_s)
         el_rad, r.rate_rad_s[1] = hold_step(b.hold, r.rate_rad_s[1], el_rad, duration_s)
         turn_by(b, r, az_rad, el_rad)

@@ -57,6 +57,7 @@ def has_arrived(s: Any, r: Any) -> bool:
 @compilable()
 def search_at(s: Any, r: Any, az_rad: float, el_rad: float) -> None:
     """The siderostat to where the search wants all that turns the star to be; link and sky are there."""
+    r.beyond_rad[0] = r.beyond_rad[1] = 0.0
     siderostat_to(
         s,
         r,

@@ -30,7 +30,7 @@ from fitctl.simulation.batch.laws import (
     start_pair,
 )
 from fitctl.simulation.batch.sensor import stages_px
-from fitctl.simulation.batch.siderostat import motor_px, motor_rad, siderostat_to
+from fitctl.simulation.batch.siderostat import motor_px, motor_rad, undo_turn
 
 OFF, STANDBY, LOCKED = int(Mode.OFF), int(Mode.STANDBY), int(Mode.LOCKED)
 ACQUIRE, POWER_UP = int(Trigger.ACQUIRE), int(Trigger.STANDBY)
@@ -174,12 +174,7 @@ def follow_link(s: Any, r: Any, rr: Any) -> None:
         undo_to_setpoint(s, r, rr)
     elif rr.beams[s.link].mode == LOCKED and r.search_due == NOT_DUE:
         undo_to_setpoint(s, r, rr)
-        siderostat_to(
-            s,
-            r,
-            r.setpoint_rad[0] + (az_rad - r.undone_rad[0]),
-            r.setpoint_rad[1] + (el_rad - r.undone_rad[1]),
-        )
+        undo_turn(s, r, az_rad - r.undone_rad[0], el_rad - r.undone_rad[1])
 
 
 @compilable()
@@ -191,12 +186,7 @@ def follow_sky(s: Any, r: Any) -> None:
     for axis in range(2):
         r.sky_undone_rad[axis] = s.sky_rad_s[axis] * (r.now_s + s.period_s)
     if s.star_is_followed and r.mode in (ACQUISITION, COARSE, VERNIER):
-        siderostat_to(
-            s,
-            r,
-            r.setpoint_rad[0] + (az_rad - r.sky_undone_rad[0]),
-            r.setpoint_rad[1] + (el_rad - r.sky_undone_rad[1]),
-        )
+        undo_turn(s, r, az_rad - r.sky_undone_rad[0], el_rad - r.sky_undone_rad[1])
 
 
 @compilable()

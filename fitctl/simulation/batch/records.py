@@ -114,6 +114,7 @@ STAR = np.dtype(
         ("link_motor_rad", "f8", (2,)),
         ("link_origin_rad", "f8", (2,)),
         ("undone_rad", "f8", (2,)),
+        ("beyond_rad", "f8", (2,)),
         ("sky_time_s", "f8"),
         ("sky_undone_rad", "f8", (2,)),
         # StarEstimator, Prefilter, Mirror, Pair
@@ -270,7 +271,7 @@ BEAM_SETTINGS = np.dtype(
         ("spiral", _numbers("growth_px", "speed_px_s", "acceleration_px_s2", "pitch_px")),
         *_numbers("search_radius_px", "search_again_pause_s", "search_again_s"),
         ("hold", _numbers("gain_per_s", "second_per_s")),
-        *_numbers("pull_in_rad_s", "motor_sky_rad_per_rad"),
+        *_numbers("pull_in_rad_s", "hold_most_rad", "motor_sky_rad_per_rad"),
         ("turn", "f8", (2, 2)),
         (
             "servo",

@@ -23,7 +23,7 @@ from fitctl.controllers.position_servo import position_servo
 from fitctl.controllers.spiral import plan_beam_spiral, plan_spiral
 from fitctl.controllers.spot_fit import PLACES
 from fitctl.loop.learning import MOST_NOISE_RATIO
-from fitctl.loop.metrology import PULL_IN
+from fitctl.loop.metrology import PULL_IN, hold_most_rad
 from fitctl.loop.pointing import Pointing
 from fitctl.loop.search.spiral import NEAR
 from fitctl.loop.sky import sky_rad_s
@@ -278,6 +278,7 @@ def beam_settings(
                 "second_per_s",
             ),
             "pull_in_rad_s": PULL_IN * loop.siderostat.velocity_limit_rad_s * motor_sky,
+            "hold_most_rad": hold_most_rad(loop),
             "turn": constants.turn,
             "motor_sky_rad_per_rad": motor_sky,
             **_siderostat(rig, loop_name),

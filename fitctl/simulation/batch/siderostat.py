@@ -38,6 +38,16 @@ def siderostat_to(s: Any, r: Any, az_rad: float, el_rad: float) -> None:
     r.setpoint_is_new = 1
 
 
+@compilable()
+def undo_turn(s: Any, r: Any, az_rad: float, el_rad: float) -> None:
+    """``SiderostatStage.undo``."""
+    az_rad += r.setpoint_rad[0] + r.beyond_rad[0]
+    el_rad += r.setpoint_rad[1] + r.beyond_rad[1]
+    siderostat_to(s, r, az_rad, el_rad)
+    r.beyond_rad[0] = az_rad - r.setpoint_rad[0]
+    r.beyond_rad[1] = el_rad - r.setpoint_rad[1]
+
+
 @compilable(inline=True)
 def read_encoders(s: Any, r: Any, w: Any, plant: Any) -> None:
     """``SimulatedAmplifiers.exchange``, but for the command, and the reading that the servo keeps."""
