@@ -9,12 +9,12 @@ import contextlib
 import heapq
 import os
 import zlib
-from collections import OrderedDict
+from collections import ChainMap, OrderedDict
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from pathlib import Path
-from typing import NamedTuple
+from typing import IO, NamedTuple
 
 from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, McapRecord, Message, Metadata, Schema
@@ -56,14 +56,10 @@ class _Source:
             schemas: Described[Schema] = Described(self.path)
             channels: Described[Channel] = Described(self.path)
             newest_ns = 0
-            if self.finished:  # the index knows the channels, even those of a damaged chunk
-                with contextlib.suppress(*DAMAGE):
-                    summary = SeekingReader(stream).get_summary()
-                    for schema in summary.schemas.values() if summary else ():
-                        schemas[schema.id] = schema
-                    for channel in summary.channels.values() if summary else ():
-                        channels[channel.id] = channel
-                stream.seek(0)
+            # The index knows the channels of a damaged chunk, too; but it may be damaged itself.
+            indexed_schemas, indexed_channels = self._indexed(stream)
+            known_schemas = ChainMap(schemas, indexed_schemas)
+            known_channels = ChainMap(channels, indexed_channels)
             read_bytes = 0
             try:
                 reader = StreamReader(stream, emit_chunks=True, record_size_limit=size)
@@ -77,15 +73,29 @@ class _Source:
                                 channels[record.id] = record
                             case Metadata():
                                 yield record
-                            case Message() if record.channel_id in channels:
-                                channel = channels[record.channel_id]
+                            case Message() if record.channel_id in known_channels:
+                                channel = known_channels[record.channel_id]
                                 self.went_back += record.log_time < newest_ns
                                 newest_ns = max(newest_ns, record.log_time)
-                                yield _Copied(schemas.get(channel.schema_id), channel, record)
+                                yield _Copied(known_schemas.get(channel.schema_id), channel, record)
                             case Message():
                                 self.undescribed += 1
             except DAMAGE:
                 self.unread_bytes = size - read_bytes
+
+    def _indexed(self, stream: IO[bytes]) -> tuple[Described[Schema], Described[Channel]]:
+        """What a finished file's index describes, as far as it can be read."""
+        schemas: Described[Schema] = Described(self.path)
+        channels: Described[Channel] = Described(self.path)
+        if self.finished:
+            with contextlib.suppress(*DAMAGE):
+                summary = SeekingReader(stream).get_summary()
+                for schema in summary.schemas.values() if summary else ():
+                    schemas[schema.id] = schema
+                for channel in summary.channels.values() if summary else ():
+                    channels[channel.id] = channel
+            stream.seek(0)
+        return schemas, channels
 
     def insist_sound(self) -> None:
         """Refuse to go on with a file that lacks something in its midst; a cut end is none."""

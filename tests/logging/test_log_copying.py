@@ -85,6 +85,18 @@ def test_of_a_log_damaged_anywhere_only_sound_records_are_recovered(whole, data)
         assert all(entry in rest for entry in result[1])  # in their order, none invented
 
 
+def test_a_damaged_index_costs_nothing(whole):
+    """A topic is described in it, too: what the chunks say of it comes first."""
+    path, everything = whole
+    content = path.read_bytes()
+    for at in range(content.rindex(b"fitctl.Tick"), len(content) - 8, 37):
+        damaged = bytearray(content)
+        damaged[at] ^= 1
+        saved, found = recovered(path, bytes(damaged))
+        assert saved.records == len(everything)
+        assert found == everything
+
+
 def test_one_damaged_chunk_costs_its_own_records_only(whole):
     path, everything = whole
     content = bytearray(path.read_bytes())
