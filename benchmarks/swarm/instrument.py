@@ -45,7 +45,7 @@ from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.pair import Design
 from fitctl.drivers.interface import Devices, LoopDevices
 from fitctl.logging.queue import RecordQueue
-from fitctl.logging.records import AnyRecord, ModeChange, StarPlace
+from fitctl.logging.records import AnyRecord, ModeChange, Place
 from fitctl.messages.commands import Acquire, AnyCommand, Recover, Reply, Shutdown, Standby
 from fitctl.messages.modes import Mode
 from fitctl.model.metrology.part import MetrologyPart
@@ -140,7 +140,7 @@ class Instrument:
         self._encode = msgspec.msgpack.Encoder().encode
         self._unanswered: dict[int, tuple[float, float, str]] = {}
         self._posted = 0
-        self._places: list[StarPlace] = []
+        self._places: list[Place] = []
         self._lives = 0
         self._is_healed = False
         self._recorder_stuck_until_s = 0.0
@@ -308,7 +308,7 @@ class Instrument:
     def _once_a_second(self) -> None:
         queue, supervisor = self._queue, self.supervisor
         queue.pump()
-        self._places = supervisor.star_places
+        self._places = supervisor.places
         self._machine.look()
         self.recorder.disk_is_full = self._computer.disk_is_full
 

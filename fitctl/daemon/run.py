@@ -29,6 +29,7 @@ from fitctl.daemon.devices import rig_devices
 from fitctl.daemon.last_records import finish_log
 from fitctl.daemon.locks import only_master, only_supervisor
 from fitctl.daemon.machine import Machine
+from fitctl.daemon.places import Places
 from fitctl.daemon.service_manager import (
     ALIVE,
     ENDING,
@@ -36,7 +37,6 @@ from fitctl.daemon.service_manager import (
     status_line,
     tell_service_manager,
 )
-from fitctl.daemon.star_places import StarPlaces
 from fitctl.logging.queue import RecordQueue
 from fitctl.logging.records import AnyRecord, RunInfo, Severity
 from fitctl.messages.endpoints import (
@@ -179,11 +179,11 @@ def run_supervisor(
             rig, queue, folder, partial(write_running, folder, rig.name, rig_file, settings)
         )
 
-        places = stack.enter_context(_star_places(folder, supervisor))
+        places = stack.enter_context(_places(folder, supervisor))
 
         def housekeep() -> None:
             keep_bound()
-            places.write(supervisor.star_places)
+            places.write(supervisor.places)
             queue.pump()
             record(buffer.losses(state, clock.now_s()))
             collector.collect(pointing=supervisor.pointing)
@@ -248,9 +248,9 @@ def _remove_left(folder: Path) -> None:
         (folder / name).unlink(missing_ok=True)
 
 
-def _star_places(folder: Path, supervisor: Supervisor) -> StarPlaces:
-    """The file of the stars' places; the supervisor knows what is in it."""
-    places = StarPlaces(folder)
+def _places(folder: Path, supervisor: Supervisor) -> Places:
+    """The file of the places of stars and beams; the supervisor knows what is in it."""
+    places = Places(folder)
     supervisor.recall(places.read())
     return places
 

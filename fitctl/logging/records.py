@@ -231,7 +231,8 @@ class OutputsFound(Record, frozen=True, kw_only=True):
 class StarPlace(Record, frozen=True, kw_only=True):
     """Position of the star that a killed supervisor held: on the camera, with the loop's own stages at zero.
 
-    The motors are where they were then; without a link, those of its siderostat are at 0.
+    The motors are where they were then; without a link, those of its siderostat are at 0. By then, a star that
+    moves by itself had moved as far as the motors turn it by these angles.
     """
 
     loop: str
@@ -239,8 +240,25 @@ class StarPlace(Record, frozen=True, kw_only=True):
     el_px: float
     siderostat_az_rad: float
     siderostat_el_rad: float
-    link_az_rad: float
-    link_el_rad: float
+    link_az_rad: float = 0.0
+    link_el_rad: float = 0.0
+    moved_az_rad: float = 0.0
+    moved_el_rad: float = 0.0
+    rate_az_sky_arcsec_s: float = 0.0
+    rate_el_sky_arcsec_s: float = 0.0
+
+
+class BeamPlace(Record, frozen=True, kw_only=True):
+    """Middle of the search in which a killed supervisor had not found the beam, and where the motors were."""
+
+    loop: str
+    search_az_rad: float
+    search_el_rad: float
+    siderostat_az_rad: float
+    siderostat_el_rad: float
+
+
+Place = StarPlace | BeamPlace
 
 
 class DeviceFailure(Record, frozen=True, kw_only=True):
@@ -405,6 +423,7 @@ AnyRecord = (
     | DevicesOpened
     | OutputsFound
     | StarPlace
+    | BeamPlace
     | DeviceFailure
     | ControllerChange
     | QuantityReading

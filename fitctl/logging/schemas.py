@@ -25,6 +25,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 
 from fitctl.logging.records import (
     AnyRecord,
+    BeamPlace,
     CommandRecord,
     ControllerChange,
     DeviceFailure,
@@ -60,6 +61,7 @@ TOPICS: dict[type[AnyRecord], str] = {
     DevicesOpened: "/fit/{loop}/opened",
     OutputsFound: "/fit/{loop}/outputs_found",
     StarPlace: "/fit/{loop}/star_place",
+    BeamPlace: "/fit/{loop}/beam_place",
     DeviceFailure: "/fit/{loop}/failure",
     QuantityReading: "/fit/quantities",
     ExperimentStart: "/fit/{loop}/experiment",

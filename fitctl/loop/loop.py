@@ -10,14 +10,14 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import QUANTITIES, AnyLoop, Rig
 from fitctl.drivers.interface import AzEl, Frame
-from fitctl.logging.records import FailingDevice, MetrologyTick, ModeChange, Severity, Tick
+from fitctl.logging.records import FailingDevice, MetrologyTick, ModeChange, Place, Severity, Tick
 from fitctl.loop.interlocks import Interlocks
 from fitctl.loop.quantities import Quantities
 from fitctl.messages.commands import Acquire, AnyCommand
@@ -59,6 +59,8 @@ class Loop(ABC):
 
     Attributes
     ----------
+    place_kind : type
+        Record of where the loop's star or beam is.
     transitions : tuple of Transition
         The table of modes of this kind of loop.
     mode : Mode
@@ -70,6 +72,7 @@ class Loop(ABC):
     """
 
     transitions: ClassVar[tuple[Transition, ...]] = TRANSITIONS
+    place_kind: ClassVar[type[Place]]
 
     def __init__(
         self,
@@ -139,6 +142,15 @@ class Loop(ABC):
     def usable_commands(self) -> list[Trigger]:
         """The commands that mean something in the mode."""
         return usable_commands(self.mode, self.transitions)
+
+    @property
+    @abstractmethod
+    def place(self) -> Place | None:
+        """Where its star or beam is, for a supervisor after this one; None where there is nothing to know."""
+
+    @abstractmethod
+    def recall(self, place: Any) -> None:
+        """Expect it where a supervisor that was killed had it; `place` is a `place_kind`."""
 
     @abstractmethod
     def state(self, now_s: float) -> LoopState:

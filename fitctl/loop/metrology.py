@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,7 +27,7 @@ from fitctl.drivers.interface import (
     Photodiodes,
     ServoReading,
 )
-from fitctl.logging.records import MetrologyTick
+from fitctl.logging.records import BeamPlace, MetrologyTick
 from fitctl.loop.loop import Loop
 from fitctl.loop.quantities import MetrologyQuantities, metrology_places
 from fitctl.loop.search.beam import BeamSearch
@@ -94,6 +95,7 @@ class MetrologyLoop(Loop):
     """
 
     transitions = METROLOGY_TRANSITIONS
+    place_kind = BeamPlace
 
     def __init__(
         self,
@@ -121,6 +123,7 @@ class MetrologyLoop(Loop):
         self._photodiode_error: DeviceError | None = None
         self._asked = Acquire()
         self.zeros_lost = 0
+        self._recalled: BeamPlace | None = None  # until the devices are open
         self._motor_sky = settings.siderostat.sky_rad_per_motor_rad
         self._turn = rotation(settings.siderostat.rotation_deg)
         self._pull_in_rad_s = PULL_IN * settings.siderostat.velocity_limit_rad_s * self._motor_sky
@@ -295,8 +298,39 @@ class MetrologyLoop(Loop):
             self.servo.encoders_jumped = False
             self.zeros_lost += 1
             self.search.forget()
+        recalled, self._recalled = self._recalled, None
+        if recalled is not None and self.search.unfound_rad is not None:
+            self._journal.record(msgspec.structs.replace(recalled, time_s=self._clock.now_s()))
+            self._report_event(
+                "info",
+                "the place of the search for the beam is known from before the supervisor was killed; acquire "
+                "goes back there",
+            )
         self._sampled_s, self._ticked_s = self._clock.now_s(), math.nan
         self._ready = True
+
+    @property
+    def place(self) -> BeamPlace | None:
+        """Where the next search begins; None if that is where the siderostat stands."""
+        unfound_rad = self.search.unfound_rad
+        if unfound_rad is None or self.servo.encoders_jumped:
+            return None
+        search_az_rad, search_el_rad = unfound_rad.tolist()
+        az_rad, el_rad = self.servo.position_rad.tolist()
+        return BeamPlace(
+            time_s=self._clock.now_s(),
+            loop=self.name,
+            search_az_rad=search_az_rad,
+            search_el_rad=search_el_rad,
+            siderostat_az_rad=az_rad,
+            siderostat_el_rad=el_rad,
+        )
+
+    def recall(self, place: BeamPlace) -> None:
+        """Search for the beam where a supervisor that was killed did."""
+        self._recalled = place
+        self.servo.recall((place.siderostat_az_rad, place.siderostat_el_rad))
+        self.search.unfound_rad = np.array([place.search_az_rad, place.search_el_rad])
 
     def jog(self, step_sky_arcsec: Floats) -> None:
         """Turn the siderostat by hand; the next search begins there."""

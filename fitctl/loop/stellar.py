@@ -62,6 +62,8 @@ class StellarLoop(Loop):
         At work in VERNIER at first.
     """
 
+    place_kind = StarPlace
+
     def __init__(
         self,
         name: str,
@@ -536,10 +538,10 @@ class StellarLoop(Loop):
             self.siderostat.undo(link.step_rad())
 
     def _follow_sky(self, sky: Sky, now_s: float) -> None:
-        """Undo what the star moves by itself, as long as it is tracked."""
+        """Undo what the star moves by itself, as long as it is tracked and its light arrives."""
         if self.mode not in TRACKING:
             sky.begin(now_s)
-        elif not self.waits_for and self._search_due is None:
+        elif (self.link is None or self.link.holds) and self._search_due is None:
             self.siderostat.undo(sky.step_rad(now_s))
 
     # ------------------------------------------------------------ control laws
@@ -739,15 +741,17 @@ class StellarLoop(Loop):
             )
         self._forget_with_link_zero()
         if recalled is not None and self.star_finder.estimator.origin_px is not None:
-            self._journal.record(msgspec.structs.replace(recalled, time_s=self._clock.now_s()))
+            now_s = self._clock.now_s()
+            moved = self._moved_by(now_s)
+            self._journal.record(msgspec.structs.replace(recalled, time_s=now_s, **moved))
             self._report_event(
                 "info",
                 "the star's place is known from before the supervisor was killed; acquire goes back there",
             )
 
     @property
-    def star_place(self) -> StarPlace | None:
-        """Where its star is, for a supervisor after this one; None where nothing is known of it."""
+    def place(self) -> StarPlace | None:
+        """Where its star is; None where nothing is known of it."""
         estimator = self.star_finder.estimator
         # Encoders that have jumped since the star was found have another zero than its place.
         jumped = self.servo.encoders_jumped or (self.link is not None and self.link.zero_is_lost)
@@ -760,8 +764,9 @@ class StellarLoop(Loop):
             link_rad = self.link.turned_with(link_motor_rad)
         link_az_px, link_el_px = estimator.stages_px(link_rad, np.zeros(2))
         link_az_rad, link_el_rad = link_motor_rad.tolist()
+        now_s = self._clock.now_s()
         return StarPlace(
-            time_s=self._clock.now_s(),
+            time_s=now_s,
             loop=self.name,
             az_px=estimator.origin_px[0] + link_az_px,
             el_px=estimator.origin_px[1] + link_el_px,
@@ -769,7 +774,21 @@ class StellarLoop(Loop):
             siderostat_el_rad=el_rad,
             link_az_rad=link_az_rad,
             link_el_rad=link_el_rad,
+            **self._moved_by(now_s),
         )
+
+    def _moved_by(self, time_s: float) -> dict[str, float]:
+        """How far its star has moved by itself by a time, and how fast it does: fields of a `StarPlace`."""
+        if self.sky is None:
+            return {}
+        rate = self.sky.rate_sky_arcsec_s or AxisPair(az=0.0, el=0.0)
+        moved_az_rad, moved_el_rad = self.sky.turned_at(time_s).tolist()
+        return {
+            "moved_az_rad": moved_az_rad,
+            "moved_el_rad": moved_el_rad,
+            "rate_az_sky_arcsec_s": rate.az,
+            "rate_el_sky_arcsec_s": rate.el,
+        }
 
     def recall(self, place: StarPlace) -> None:
         """Expect the star where a supervisor that was killed had it."""
@@ -777,6 +796,12 @@ class StellarLoop(Loop):
         self.servo.recall((place.siderostat_az_rad, place.siderostat_el_rad))
         if self.link is not None:
             self.link.recall((place.link_az_rad, place.link_el_rad))
+        moved_rad = np.array([place.moved_az_rad, place.moved_el_rad])
+        rate = AxisPair(az=place.rate_az_sky_arcsec_s, el=place.rate_el_sky_arcsec_s)
+        if moved_rad.any() or rate.az or rate.el:
+            if self.sky is None:
+                self.sky = Sky(self._scale, self._period_s, place.time_s)
+            self.sky.recall(place.time_s, moved_rad, rate)
         self.star_finder.estimator.observe((place.az_px, place.el_px), (0.0, 0.0))
         self._link_counts = True
 

@@ -25,6 +25,7 @@ from fitctl.logging.reading import (
 from fitctl.logging.records import (
     CAMERA,
     AnyRecord,
+    BeamPlace,
     CommandRecord,
     ControllerChange,
     DeviceFailure,
@@ -51,6 +52,7 @@ _AT_THE_START_S = 10.0  # the first record of a run comes within this
 # What a step begins with; then come its ticks, each after what led to it; then the frame, and the rest.
 _BEGIN = {CommandRecord, ControllerChange, DevicesOpened, PiezoReading, QuantityReading}
 _BEFORE_TICK = {
+    BeamPlace,
     ControllerChange,
     DeviceFailure,
     ExperimentStart,

@@ -30,8 +30,8 @@ from fitctl.logging.records import (
     ModeChange,
     Overlap,
     PiezoReading,
+    Place,
     QuantityReading,
-    StarPlace,
     Tick,
 )
 from fitctl.loop.loop import Loop
@@ -154,17 +154,9 @@ class Replay:
         self._executor.load_step(step)
         for name, servo in self._servos.items():
             servo.load_step(step)
-            for failure in step.of(DeviceFailure, name):
-                if failure.device == "piezo":
-                    supervisor.piezos[name].evaluate(_piezo_answer(failure))
-        for name, mirror in self._mirrors.items():
+            self._load_before_tick(step, name)
+        for mirror in self._mirrors.values():
             mirror.load_step(step)
-            for place in step.of(StarPlace, name):
-                # A log from before 2026-11-29 does not say where the link's siderostat was.
-                given: dict[str, Any] = {
-                    field: getattr(place, field, 0.0) for field in StarPlace.__struct_fields__
-                }
-                supervisor.stellar_loops[name].recall(StarPlace(**given))
         for photodiodes in self._photodiodes.values():
             photodiodes.load_step(step)
         for reading in step.of(PiezoReading):
@@ -177,6 +169,15 @@ class Replay:
                 self._post(command)
             elif command.command == "SetController":
                 self.result.controllers_left_out += 1
+
+    def _load_before_tick(self, step: LoggedStep, name: str) -> None:
+        """What one loop knows beside its devices' answers."""
+        for failure in step.of(DeviceFailure, name):
+            if failure.device == "piezo":
+                self._supervisor.piezos[name].evaluate(_piezo_answer(failure))
+        loop = self._supervisor.loops[name]
+        for place in step.of(loop.place_kind, name):
+            loop.recall(_as_recorded(loop.place_kind, place))
 
     def _post(self, message: Any) -> None:
         try:
@@ -283,6 +284,14 @@ def _begin_s(step: LoggedStep) -> float:
     for tick in step.ticks.values():
         return float(tick.time_s - tick.compute_s)
     return step.begin[0].message.time_s if step.begin else math.nan
+
+
+def _as_recorded(kind: type[Place], message: Any) -> Place:
+    """A record as it was recorded; what a log of an older version does not have is as by default."""
+    given = {
+        name: getattr(message, name) for name in kind.__struct_fields__ if hasattr(message, name)
+    }
+    return kind(**given)
 
 
 def _piezo_answer(message: Any) -> Future:

@@ -27,9 +27,9 @@ from fitctl.logging.records import (
     Event,
     FrameRecord,
     LoopTiming,
+    Place,
     QuantityReading,
     Severity,
-    StarPlace,
 )
 from fitctl.loop.learning import refused_report
 from fitctl.loop.loop import Loop
@@ -260,19 +260,19 @@ class Supervisor:
         return [*self._servo_groups, *(work for work in each if work not in grouped), *drives]
 
     @property
-    def star_places(self) -> list[StarPlace]:
-        """Where the stars are that the loops know of; for :meth:`recall` of a supervisor after this one."""
-        places = (loop.star_place for loop in self.stellar_loops.values())
+    def places(self) -> list[Place]:
+        """Where the loops know their stars and beams to be, for :meth:`recall` of a supervisor after this."""
+        places = (loop.place for loop in self.loops.values())
         return [place for place in places if place is not None]
 
-    def recall(self, places: Iterable[StarPlace]) -> None:
-        """Know where a supervisor that was killed had its stars; called before the first step."""
-        loops, now_s = self.stellar_loops, self._clock.now_s()
+    def recall(self, places: Iterable[Place]) -> None:
+        """Know where a supervisor that was killed had its stars and beams; called before the first step."""
+        now_s = self._clock.now_s()
         for place in places:
-            if (
-                place.loop in loops and place.time_s <= now_s
-            ):  # else the computer has restarted since
-                loops[place.loop].recall(place)
+            loop = self.loops.get(place.loop)
+            # A place of later than now is from before the computer restarted.
+            if loop is not None and isinstance(place, loop.place_kind) and place.time_s <= now_s:
+                loop.recall(place)
 
     # ------------------------------------------------------------ once a frame
 

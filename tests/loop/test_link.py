@@ -427,6 +427,20 @@ def test_a_photodiode_that_comes_loose_for_a_second_turns_the_left_siderostat_li
     assert (rms_px < one.loop(LEFT).settings.requirement_px).all()
 
 
+def test_a_star_that_moves_while_its_link_is_lost_is_held_again_without_a_search():
+    moves = "loops.left.star_rate_sky_arcsec_s={az=12.0, el=-9.0}"
+    one = Testbed(moves, f"plant.{moves}").held()
+    one.run(2.0)
+    one.records.clear()
+    one.laser(0.0)
+    one.run(20.0)  # 300 arcsec
+    one.laser(1.0)
+    one.until(metrology=Mode.LOCKED).run(3.0)
+    changes = [record for record in one.records if isinstance(record, ModeChange)]
+    assert {change.loop for change in changes} == {METROLOGY}
+    assert (one.rms_px(LEFT, one.clock.now_s() - 1.0) < 0.05).all()
+
+
 @pytest.mark.parametrize("amplitude_mm", [0.5, -0.5])
 def test_a_link_that_turns_beyond_the_left_siderostats_travel_and_back_leaves_it_where_it_was(
     amplitude_mm,

@@ -21,7 +21,12 @@ NOTHING = {name: DEFAULTS[kind] for name, kind in Tick.__annotations__.items()}
 
 
 class Watcher(Loop):
-    """Senses that a frame came, and leaves the siderostat where it is."""
+    """Senses that a frame came, and leaves the siderostat where it is; it looks for nothing."""
+
+    place = None
+
+    def recall(self, place):
+        raise NotImplementedError
 
     def sense(self, frame, frames_lost, frames_skipped):
         self.number, self.begun_s = -1 if frame is None else frame.number, self._clock.now_s()

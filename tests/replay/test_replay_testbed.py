@@ -10,7 +10,7 @@ from samples.replay_courses import SOON, TIMEOUT, replayed
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.logging.errors import LogError
-from fitctl.logging.records import Event, MetrologyTick, ModeChange, Overlap, Tick
+from fitctl.logging.records import BeamPlace, Event, MetrologyTick, ModeChange, Overlap, Tick
 from fitctl.messages.commands import Acquire, Off, Recover, SetController, Standby, Stop
 from fitctl.messages.modes import Mode
 
@@ -110,7 +110,23 @@ def the_encoders_lose_their_zero(simulation):
     simulation.run(3.0)
 
 
+def a_beam_of_a_killed_supervisor(simulation):
+    """The search begins where a supervisor before this one had not found its beam."""
+    place = BeamPlace(
+        time_s=0.0,
+        loop="metrology",
+        search_az_rad=2.0,
+        search_el_rad=-1.0,
+        siderostat_az_rad=0.0,
+        siderostat_el_rad=0.0,
+    )
+    simulation.supervisor.recall([place])
+    hold_all(simulation)
+    simulation.run(2.0)
+
+
 COURSES = {
+    "a beam of a killed supervisor": (a_beam_of_a_killed_supervisor, [], {"BEAM_FOUND"}),
     "everything": (everything, [DRIFT], {"BEAM_LOST", "BEAM_FOUND", "IN_REACH", "STOP", "RECOVER"}),
     "plays": (hold_and_drift, [DRIFT, *PLAYS], {"BEAM_FOUND", "IN_REACH"}),
     "no sample can be read": (the_converter_fails("receive"), [], {"FAULT", "RECOVER"}),

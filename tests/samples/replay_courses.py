@@ -156,20 +156,23 @@ def a_mirror_that_the_watchdog_moves(simulation):
     hold_a_star_from_standby(simulation)
 
 
-def a_star_of_a_killed_supervisor(simulation):
+def a_star_of_a_killed_supervisor(**moved):
     """The search begins where a supervisor before this one had its star."""
-    place = StarPlace(
-        time_s=0.0,
-        loop="right",
-        az_px=-20.0,
-        el_px=40.0,
-        siderostat_az_rad=0.0,
-        siderostat_el_rad=0.0,
-        link_az_rad=0.0,
-        link_el_rad=0.0,
-    )
-    simulation.supervisor.recall([place])
-    hold_a_star(simulation)
+
+    def course(simulation):
+        place = StarPlace(
+            time_s=0.0,
+            loop="right",
+            az_px=-20.0,
+            el_px=40.0,
+            siderostat_az_rad=0.0,
+            siderostat_el_rad=0.0,
+            **moved,
+        )
+        simulation.supervisor.recall([place])
+        hold_a_star(simulation)
+
+    return course
 
 
 def an_off_that_waits_for_the_mirror(simulation):
@@ -332,7 +335,12 @@ COURSES = {
     "the D/A fails between frames": (_fails("dac", "confirm"), SEVERAL_WRITES, FAULT),
     "a stall": (a_stall, [], {"IN_REACH"}),
     "the D/A's own watchdog": (a_mirror_that_the_watchdog_moves, [SOON], {"FAULT", "IN_REACH"}),
-    "a star of a killed supervisor": (a_star_of_a_killed_supervisor, [], {"IN_REACH"}),
+    "a star of a killed supervisor": (a_star_of_a_killed_supervisor(), [], {"IN_REACH"}),
+    "a moving star of a killed supervisor": (
+        a_star_of_a_killed_supervisor(moved_az_rad=0.3, rate_el_sky_arcsec_s=-0.2),
+        [],
+        {"IN_REACH"},
+    ),
     "a refused Off": (an_off_that_waits_for_the_mirror, [SOON], {"IN_REACH"}),
     "the D/A takes nothing": (_fails("dac", "send_v"), [], FAULT),
     "the D/A confirms nothing": (_fails("dac", "confirm"), [], FAULT),

@@ -402,8 +402,10 @@ def assert_same_loops(simulation, samples, run):
                 "collector.motion.kind=still",
                 "plant.loops.metrology.air_path.rms_sky_arcsec=60.0",
                 "loops.metrology.acquisition.search_again_pause_s=0.2",
+                "plant.loops.left.star_rate_sky_arcsec_s={az=8.0, el=5.0}",
+                "loops.left.star_rate_sky_arcsec_s={az=8.0, el=5.0}",
             ],
-            id="beam out of reach and back",
+            id="beam out of reach and back, and one star moves",
         ),
         pytest.param(
             [

@@ -41,7 +41,7 @@ def searches_elsewhere(simulation):
 
 def killed(simulation, *, recall=True):
     """Another supervisor on the same devices, as the one before it left them."""
-    places = simulation.supervisor.star_places
+    places = simulation.supervisor.places
     for devices in simulation.devices.loops.values():
         devices.amplifiers.disable()
     simulation.supervisor = Supervisor(
@@ -139,7 +139,7 @@ def test_encoders_that_lost_their_zero_lead_nowhere(simulate_with):
     texts = [event.message for event in events_of(simulation)]
     assert any(FORGOTTEN in text for text in texts)
     assert not any(KNOWN in text for text in texts)
-    assert simulation.supervisor.star_places == []
+    assert simulation.supervisor.places == []
 
 
 @pytest.mark.long
@@ -235,7 +235,7 @@ def test_a_place_with_the_link_goes_through_any_number_of_killed_supervisors():
     simulation.command(Standby(loop="metrology"))
     simulation.command(Acquire(loop="metrology"))
     simulation.run(0.5)
-    assert places[1].loop == "left"
+    assert {place.loop for place in places} == {"metrology", "left", "right"}
 
     killed(simulation)
     simulation.acquire()
@@ -247,11 +247,11 @@ def test_a_link_whose_encoders_lost_their_zero_leads_nowhere():
     simulation, _ = killed_while_the_link_searches()
     lose_zero(simulation, "metrology")
     simulation.command(Standby(loop="left"))
-    assert {place.loop for place in simulation.supervisor.star_places} == {"left", "right"}
+    assert {place.loop for place in simulation.supervisor.places} == {"metrology", "left", "right"}
 
     simulation.command(Standby(loop="metrology"))
 
-    assert {place.loop for place in simulation.supervisor.star_places} == {"right"}
+    assert {place.loop for place in simulation.supervisor.places} == {"right"}
     simulation.run(0.1)
     texts = [event.message for event in events_of(simulation) if event.source == "left"]
     assert any("encoders of metrology" in text and FORGOTTEN in text for text in texts)
@@ -262,10 +262,64 @@ def test_a_place_says_where_the_motors_were(simulate_with):
     simulation.acquire()
     until(simulation, Mode.VERNIER)
 
-    (place,) = simulation.supervisor.star_places
+    (place,) = simulation.supervisor.places
 
     assert place.loop == "right"
     assert (place.link_az_rad, place.link_el_rad) == (0.0, 0.0)
     motor_rad = simulation.supervisor.servos["right"].position_rad
     assert (place.siderostat_az_rad, place.siderostat_el_rad) == tuple(motor_rad)
     assert math.isfinite(place.az_px + place.el_px)
+
+
+@pytest.mark.long
+def test_a_beam_that_was_not_found_is_searched_for_where_it_was():
+    simulation, places = killed_while_the_link_searches()
+    (beam,) = [place for place in places if place.loop == "metrology"]
+    simulation.command(Standby())
+    simulation.run(0.1)
+
+    assert simulation.command(Acquire(loop="metrology")).accepted
+    loop = simulation.supervisor.loops["metrology"]
+    assert loop.search.centre_rad.tolist() == [beam.search_az_rad, beam.search_el_rad]
+    texts = [event.message for event in events_of(simulation) if event.source == "metrology"]
+    assert any("the search for the beam is known" in text for text in texts)
+
+
+@pytest.mark.long
+def test_encoders_that_lost_their_zero_lead_to_no_place_of_a_search_for_a_beam():
+    simulation, _ = killed_while_the_link_searches()
+    lose_zero(simulation, "metrology")
+    simulation.command(Standby())
+
+    assert simulation.supervisor.loops["metrology"].place is None
+
+
+RATE = "plant.loops.right.star_rate_sky_arcsec_s={az=0.4, el=-0.3}"
+
+
+@pytest.mark.long
+def test_a_star_whose_rate_a_command_gave_goes_on_to_move_for_the_next_supervisor(simulate_with):
+    simulation = simulate_with(RATE, star_offset_px=(10.0, -6.0))
+    given = Acquire(rate_az_sky_arcsec_s=0.4, rate_el_sky_arcsec_s=-0.3)
+    simulation.command(Standby())
+    simulation.run(0.2)
+    assert simulation.command(given).accepted
+    until(simulation, Mode.VERNIER)
+    simulation.run(60.0)  # 30 arcsec
+
+    (place,) = killed(simulation)
+    simulation.run(20.0)
+    (later,) = simulation.supervisor.places
+    killed(simulation)
+    simulation.command(Standby())
+    simulation.run(0.2)
+    simulation.command(Acquire())
+
+    assert place.rate_az_sky_arcsec_s == later.rate_az_sky_arcsec_s == 0.4
+    assert later.moved_az_rad > 1.2 * place.moved_az_rad
+    until(simulation, Mode.VERNIER, limit_s=10.0)
+    target_px = simulation.supervisor.stellar_loops["right"].target_px
+    simulation.run(30.0)
+    spot_px = simulation.plants["right"].spots_px(simulation.clock.now_s())[0, 0]
+    assert spot_px == pytest.approx(target_px, abs=0.15)
+    assert mode_of(simulation) is Mode.VERNIER

@@ -31,6 +31,11 @@ class BeamSearch(SpiralSearch):
     ----------
     rig : Rig
     loop_name : str
+
+    Attributes
+    ----------
+    unfound_rad : array, shape (2,), or None
+        Motor angles in the middle of a search that has not found the beam; None after one that has.
     """
 
     def __init__(self, rig: Rig, loop_name: str) -> None:
@@ -38,7 +43,7 @@ class BeamSearch(SpiralSearch):
         siderostat = loop.siderostat
         self._sky_arcsec_per_motor_rad = siderostat.sky_arcsec_per_motor_rad
         px_per_motor_rad = siderostat.sky_rad_per_motor_rad * sky_px_per_rad(rig)
-        self._unfound_rad: Floats | None = None  # the middle of a search that did not find the beam
+        self.unfound_rad: Floats | None = None
         super().__init__(
             _BEAM,
             loop.acquisition,
@@ -53,16 +58,16 @@ class BeamSearch(SpiralSearch):
 
         Here, with the motors at `motor_rad`, shape (2,), is the last place of a beam that was lost.
         """
-        centre_rad = motor_rad if self._unfound_rad is None else self._unfound_rad
+        centre_rad = motor_rad if self.unfound_rad is None else self.unfound_rad
         place_sky_arcsec = asked_place_sky_arcsec(asked)
         if place_sky_arcsec is not None:
             centre_rad = place_sky_arcsec / self._sky_arcsec_per_motor_rad
-        self._unfound_rad = centre_rad
+        self.unfound_rad = centre_rad
         self.start(centre_rad, again=again, radius_sky_arcsec=asked.search_radius_sky_arcsec)
 
     def forget(self) -> None:
         """The next search begins where the siderostat then is."""
-        self._unfound_rad = None
+        self.unfound_rad = None
 
     def evaluate(self, has_light: bool, motor_rad: Floats, now_s: float) -> Finding | None:
         """What a sample taken at `now_s`, with the motors at `motor_rad`, means for the search."""

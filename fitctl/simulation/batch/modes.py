@@ -178,9 +178,10 @@ def follow_link(s: Any, r: Any, rr: Any) -> None:
 
 
 @compilable()
-def follow_sky(s: Any, r: Any) -> None:
+def follow_sky(s: Any, r: Any, rr: Any) -> None:
     """``StellarLoop._follow_sky``."""
-    if r.mode in (ACQUISITION, COARSE, VERNIER) and (r.waits or r.search_due != NOT_DUE):
+    light_arrives = s.link < 0 or rr.beams[s.link].mode == LOCKED
+    if r.mode in (ACQUISITION, COARSE, VERNIER) and not (light_arrives and r.search_due == NOT_DUE):
         return
     az_rad, el_rad = r.sky_undone_rad[0], r.sky_undone_rad[1]
     for axis in range(2):

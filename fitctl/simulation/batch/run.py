@@ -150,7 +150,7 @@ def tick_star(
         return False
     if s.link >= 0:
         follow_link(s, r, rr)
-    follow_sky(s, r)
+    follow_sky(s, r, rr)
     if not r.waits:
         command(s, r, w)
         r.later_s = exposed_s + s.later_after_s
@@ -168,7 +168,7 @@ def wait_for_frame(ss: Any, rr: Any, ww: Any, i: int) -> None:
     evaluate_waiting(ss, rr, i)
     if s.link >= 0:
         follow_link(s, r, rr)
-    follow_sky(s, r)
+    follow_sky(s, r, rr)
 
 
 @compilable()

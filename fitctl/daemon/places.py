@@ -1,4 +1,4 @@
-"""Where the stars are, in a file for the supervisor that follows one that was killed."""
+"""Where stars and beams are, in a file for the supervisor that follows one that was killed."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from typing import Self
 import msgspec
 
 from fitctl.files import read_regular
-from fitctl.logging.records import StarPlace
+from fitctl.logging.records import Place
 from fitctl.text import UNDECODABLE
 
-FILE = "stars.json"  # in the socket folder
+FILE = "places.json"  # in the socket folder
 _MOST_BYTES = 65536
 _PATIENCE_S = 1.0
 
 
-class StarPlaces:
+class Places:
     """The file of one rig; written on a thread of its own, because a disk may let everyone wait who writes.
 
     Parameters
@@ -30,22 +30,22 @@ class StarPlaces:
 
     def __init__(self, folder: Path) -> None:
         self._path = folder / FILE
-        self._wanted: Sequence[StarPlace] | None = None
+        self._wanted: Sequence[Place] | None = None
         self._some = threading.Event()
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._write, name="places", daemon=True)
         self._thread.start()
 
-    def read(self) -> list[StarPlace]:
+    def read(self) -> list[Place]:
         """What a supervisor that was killed left; nothing where there is none, or nothing that can be read."""
         try:
             return msgspec.json.decode(
-                read_regular(self._path, _MOST_BYTES), type=list[StarPlace], strict=True
+                read_regular(self._path, _MOST_BYTES), type=list[Place], strict=True
             )
         except (OSError, *UNDECODABLE):
             return []
 
-    def write(self, places: Sequence[StarPlace]) -> None:
+    def write(self, places: Sequence[Place]) -> None:
         """Leave this; waits for nothing."""
         self._wanted = places
         self._some.set()

@@ -1,11 +1,11 @@
-"""The file from which a supervisor knows where the stars were when the one before it was killed."""
+"""The file from which a supervisor knows where stars and beams were when the one before it was killed."""
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fitctl.daemon.star_places import FILE, StarPlaces
-from fitctl.logging.records import StarPlace
+from fitctl.daemon.places import FILE, Places
+from fitctl.logging.records import BeamPlace, StarPlace
 
 PLACE = StarPlace(
     time_s=5.0,
@@ -17,11 +17,19 @@ PLACE = StarPlace(
     link_az_rad=0.25,
     link_el_rad=-12.0,
 )
+BEAM = BeamPlace(
+    time_s=5.0,
+    loop="metrology",
+    search_az_rad=3.0,
+    search_el_rad=-0.5,
+    siderostat_az_rad=12.0,
+    siderostat_el_rad=7.0,
+)
 
 
 def written(folder, places):
     """Have the file written whole by one that is then killed."""
-    writer = StarPlaces(folder)
+    writer = Places(folder)
     writer.write(places)
     while writer.read() != places:
         pass
@@ -29,26 +37,26 @@ def written(folder, places):
 
 
 def test_what_a_killed_supervisor_left_is_read(tmp_path):
-    written(tmp_path, [PLACE])
+    written(tmp_path, [PLACE, BEAM])
 
-    assert StarPlaces(tmp_path).read() == [PLACE]
+    assert Places(tmp_path).read() == [PLACE, BEAM]
 
 
 def test_one_that_ends_as_told_leaves_nothing(tmp_path):
-    with written(tmp_path, [PLACE]):
+    with written(tmp_path, [PLACE, BEAM]):
         pass
 
     assert list(tmp_path.iterdir()) == []
-    assert StarPlaces(tmp_path).read() == []
+    assert Places(tmp_path).read() == []
 
 
 def test_a_folder_that_has_vanished_is_no_error(tmp_path):
     folder = tmp_path / "sockets"
     folder.mkdir()
-    with written(folder, [PLACE]) as writer:
+    with written(folder, [PLACE, BEAM]) as writer:
         (folder / FILE).unlink()
         folder.rmdir()
-        writer.write([PLACE])
+        writer.write([PLACE, BEAM])
 
     assert writer.read() == []
 
@@ -57,14 +65,14 @@ def test_a_folder_that_has_vanished_is_no_error(tmp_path):
 def test_a_damaged_file_is_none(tmp_path, left):
     (tmp_path / FILE).write_bytes(left)
 
-    assert StarPlaces(tmp_path).read() == []
+    assert Places(tmp_path).read() == []
 
 
 def test_one_that_ends_by_an_error_leaves_what_it_knew(tmp_path):
-    with pytest.raises(RuntimeError), written(tmp_path, [PLACE]):
+    with pytest.raises(RuntimeError), written(tmp_path, [PLACE, BEAM]):
         raise RuntimeError
 
-    assert StarPlaces(tmp_path).read() == [PLACE]
+    assert Places(tmp_path).read() == [PLACE, BEAM]
 
 
 @given(st.binary(max_size=200))
@@ -72,7 +80,7 @@ def test_any_other_content_is_nothing(tmp_path_factory, content):
     folder = tmp_path_factory.mktemp("sockets")
     (folder / FILE).write_bytes(content)
 
-    assert isinstance(StarPlaces(folder).read(), list)
+    assert isinstance(Places(folder).read(), list)
 
 
 @pytest.mark.parametrize(
@@ -81,4 +89,4 @@ def test_any_other_content_is_nothing(tmp_path_factory, content):
 def test_damaged_content_is_nothing(tmp_path, content):
     (tmp_path / FILE).write_bytes(content)
 
-    assert StarPlaces(tmp_path).read() == []
+    assert Places(tmp_path).read() == []
