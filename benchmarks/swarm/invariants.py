@@ -77,6 +77,7 @@ _MOST_UNREAD_S = 14.0  # interlock piezo_limit does not wait longer
 _CHECKED_S = 0.5  # so often the swarm checks which star a loop follows
 _ANOTHERS_PX = 6.0  # from its own star, no window of a loop shows its own
 _MOST_WRONG_S = 10.0
+_RETURNS_PX = 40.0  # the star of a loop that goes on is nearer to the middle of the frame
 # As `made_safe` in the fault catalogue, tests/faults/devices.py.
 _SAFE_S, _SAFE_BY_PIEZO_S = 3.0, 8.0
 _RESTS_S = 1.0  # beyond the time after which a drive without its master stops by itself
@@ -197,6 +198,7 @@ class Invariants:
         self._checked_s: dict[str, float] = {}  # by loop: when the swarm last checked its star
         self._wrong_since_s: dict[str, float] = {}  # by loop: since when it follows another star
         self._pointed_at: set[str] = set()  # a person said which star these loops follow
+        self._waits_since_s: dict[str, float] = {}  # by loop that followed its star before
 
     def _needed_devices(self, name: str) -> Iterator[tuple[str, float]]:
         """The devices whose silence makes a loop go to SAFE in any other mode but OFF, and within what time.
@@ -233,6 +235,7 @@ class Invariants:
         self._ticks.clear()
         self._wrong_since_s.clear()
         self._pointed_at.clear()
+        self._waits_since_s.clear()
         for lasting in self._lasting:
             lasting.clear()
         self._collector_is_stopped = False
@@ -467,6 +470,40 @@ class Invariants:
                 f"{now_s - since_s:.1f} s; its own is at az {own_az_px:.1f}, el {own_el_px:.1f} px",
             )
 
+    def _begins_to_wait(self, name: str) -> None:
+        self._waits_since_s.pop(name, None)
+        if name not in self._pointed_at and self._off_frame_px(name) <= _RETURNS_PX:
+            self._waits_since_s[name] = self._clock.now_s()
+
+    def _goes_on(self, name: str) -> None:
+        """Whether a loop that waited has its siderostat back at its star, if it can be there."""
+        since_s = self._waits_since_s.pop(name, None)
+        away_px = self._off_frame_px(name)
+        if since_s is None or away_px <= _RETURNS_PX or self._supervisor is None:
+            return
+        loop = self._supervisor.stellar_loops[name]
+        turned_by = [name, *filter(None, [self._stellar_loops[name].link])]
+        waited_s = self._clock.now_s() - since_s
+        misled = any(
+            self._lines[f"{one} siderostat"].was_wrong("encoder", waited_s + _MOST_WRONG_S)
+            for one in turned_by
+        )
+        at_its_end = np.abs(loop.siderostat.setpoint_rad).max() >= loop.siderostat.travel_rad
+        is_expected = loop.star_finder.estimator.origin_px is not None
+        if is_expected and not misled and not at_its_end:
+            self.violated(
+                "a loop that waited goes on at its star",
+                f"{name}: {away_px:.0f} px from it after {waited_s:.1f} s",
+            )
+
+    def _off_frame_px(self, name: str) -> float:
+        """From the middle of the frame to the own star of a loop; infinite if the loop follows none."""
+        if self._supervisor is None or self._supervisor.loops[name].mode not in FOLLOWING:
+            return math.inf
+        part, camera = self._plant.stellar_loops[name], self._rig.camera
+        az_px, el_px = part.spots_at_px(self._plant.row(self._clock.now_s()))[0, 0].tolist()
+        return math.hypot(az_px - camera.width_px / 2, el_px - camera.height_px / 2)
+
     def _camera_well(self) -> bool:
         """Nothing has been wrong with the camera's line for a while, and it loses no frames.
 
@@ -527,6 +564,10 @@ class Invariants:
         return any(line.was_wrong(fault, within_s) for fault in ("stuck", "encoder"))
 
     def _reported(self, event: Event) -> None:
+        if event.message.startswith("waits for "):
+            self._begins_to_wait(event.source)
+        elif event.message.startswith("no longer waits for "):
+            self._goes_on(event.source)
         if event.severity == "error" and event.source in self._rig.loops:
             if "->" not in event.message:
                 self._texts[event.message] += 1

@@ -30,7 +30,7 @@ WRONG: dict[str, tuple[str, ...]] = {
     "D/A": ("tripped",),
     "piezo": ("stuck", "limit"),
     "camera": ("frozen", "drops", "saturated"),
-    "photodiodes": ("saturated",),
+    "photodiodes": ("saturated", "loose"),
     "hexapod": ("offset", "stuck", "servos off"),
 }
 """Faults of a device whose line is well, by kind of device.
@@ -38,7 +38,8 @@ WRONG: dict[str, tuple[str, ...]] = {
 Amplifiers detect a fault of their own, motors do not move, or an encoder reads a wrong angle. A D/A's watchdog
 has tripped: its outputs are at their safe voltages, and it refuses every request. A stack has the highest
 voltage, or the limit switch is at another voltage. The camera repeats an image, loses half of its frames, or
-has all pixels at full scale. Photodiodes are at the end of their range. The hexapod reports a wrong pose,
+has all pixels at full scale. Photodiodes are at the end of their range, or one of them is loose and reads 0 V.
+The hexapod reports a wrong pose,
 accepts moves and does not move, or its servos are off.
 """
 SILENCE = frozenset(FAULTS) - {"slow"}
@@ -48,6 +49,7 @@ OF_SOME_CALLS = (
     "encoder",
     "limit",
     "saturated",
+    "loose",
     "offset",
 )
 """Faults that may meet only some of the calls: those of lines, and single wrong values."""
@@ -127,8 +129,9 @@ class Line:
     at_times : dict of str to SomeCalls
         Those of `OF_SOME_CALLS` that meet only some calls.
     wrong : dict of str to float
-        The faults in force, from `WRONG`. The value of "stuck" of a piezo amplifier is the stack, that of
-        "encoder" the angle in rad.
+        The faults in force, from `WRONG`. The value of "stuck" of a piezo amplifier is the stack, that
+        of "loose" the photodiode, that of "encoder" the angle in rad: azimuth's reads too much by it, or
+        elevation's too little.
     wrong_until_s : dict of str to float
         When each of those ended last.
     healed_s : float

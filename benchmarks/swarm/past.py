@@ -16,12 +16,14 @@ from fitctl.controllers.position_servo import PositionServo
 from fitctl.drivers.interface import AzEl, Frame, ServoReading
 from fitctl.logging.records import StarPlace
 from fitctl.loop.loop import Loop
+from fitctl.loop.metrology import MetrologyLoop
 from fitctl.loop.observation import Observation
 from fitctl.loop.stellar import StellarLoop
 from fitctl.messages.commands import AnyCommand, Experiment, Reply
 from fitctl.messages.modes import Mode, Trigger
 from fitctl.stages.mirror import MirrorStage
 from fitctl.stages.servo import SiderostatServo
+from fitctl.stages.siderostat import SiderostatStage
 from fitctl.supervisor import supervisor
 from fitctl.supervisor.camera_watch import CameraWatch
 from fitctl.supervisor.device_jobs import DeviceJobs
@@ -60,6 +62,10 @@ def _post_waits(
 def _ask_while_dac_ready(self: PiezoWatch) -> None:
     if self._loop.mirror.ready:
         _ASK(self)
+
+
+def _holds_any_beam(self: MetrologyLoop, sensed: Any, duration_s: float) -> None:
+    self._turn_beam(self.hold.step(self._error_rad(sensed.beam), duration_s))
 
 
 def _oldest_frame(self: CameraWatch, _meanwhile: Callable[[], float]) -> Frame | None:
@@ -308,6 +314,14 @@ DEFECTS = {
         [
             (StellarLoop, "recall", _recalls_without_link),
             (StellarLoop, "_start_search", _counts_from_the_search),
+        ],
+    ),
+    "travel-cuts-off": Defect(
+        "5a4c1678",
+        "what a link turns beyond the other siderostat's travel is lost when it turns back",
+        [
+            (SiderostatStage, "undo", SiderostatStage.move_by),
+            (MetrologyLoop, "_hold_beam", _holds_any_beam),
         ],
     ),
     "moves-in-a-fault": Defect(

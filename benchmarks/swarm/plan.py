@@ -76,6 +76,7 @@ _BOOTS = 0.5  # fraction of restarts that take time,
 _BOOT_S = -1.0, 1.0  # powers of ten of how long
 _ONCE, _LAST_CALL = 0.3, 40  # fraction of these that meet a single call, one of the next so many
 _WRONG_RAD = -1.5, 0.7  # powers of ten of what an encoder is wrong by
+_PARTS = {("piezo", "stuck"): 3, ("photodiodes", "loose"): 4}  # one of so many fails
 _AT_ONCE_S = 0.004  # mean delay between hurried commands
 _ALONE = 0.3  # fraction of stalls in which the other processes go on
 _LONG_STALL, _SILENT = 0.3, 0.5  # fractions of disturbed rests
@@ -411,12 +412,13 @@ def _strike(random: Random, at_s: float, devices: list[str], faults: list[str]) 
 
 
 def _drawn_size(random: Random, device: str, fault: str) -> float:
-    """How slow, which stack, or by how much an encoder is wrong."""
+    """How slow, which stack or photodiode, or by how much an encoder is wrong."""
     if fault == "slow":
         return drawn_slowness(random)
     if fault == "encoder":
         return random.choice((-1, 1)) * 10 ** random.uniform(*_WRONG_RAD)
-    return float(random.randrange(3)) if kind_of(device) == "piezo" and fault == "stuck" else 0.0
+    parts = _PARTS.get((kind_of(device), fault))
+    return 0.0 if parts is None else float(random.randrange(parts))
 
 
 def _interrupted_slew(random: Random, at_s: float, loops: tuple[str, ...]) -> list[Happening]:

@@ -121,18 +121,19 @@ def test_motors_that_are_stuck_do_not_move_until_they_come_free(amplifiers, does
     assert turned_rad(amplifiers, does) > 0.05
 
 
+@pytest.mark.parametrize(("size", "too_much_rad"), [(1.5, (1.5, 0.0)), (-1.5, (0.0, -1.5))])
 def test_an_encoder_that_is_wrong_reads_another_angle_and_the_motor_stays_where_it_is(
-    amplifiers, does
+    amplifiers, does, size, too_much_rad
 ):
     def read_rad():
         return does(partial(amplifiers.exchange, (0.0, 0.0))).position_rad
 
     right_rad = read_rad()
-    amplifiers.line.begin("encoder", 60.0, size=-1.5)
+    amplifiers.line.begin("encoder", 60.0, size)
     wrong_rad = read_rad()
     amplifiers.line.heal()
 
-    assert wrong_rad == pytest.approx((right_rad[0] - 1.5, right_rad[1]))
+    assert wrong_rad == pytest.approx(np.add(right_rad, too_much_rad))
     assert read_rad() == right_rad
 
 
@@ -227,6 +228,18 @@ def test_photodiodes_are_at_the_end_of_their_range(time, plant, does):
     volts = photodiodes.receive().volts
     assert volts == (sensor.device.range_v,) * 4
     assert min(volts) >= sensor.saturated_v
+
+
+def test_a_photodiode_that_is_loose_reads_nothing_and_the_others_what_they_see(time, plant, does):
+    photodiodes = SwarmPhotodiodes(plant.loops["metrology"], time, RIG, "metrology", Random(1))
+    does(photodiodes.open)
+    photodiodes.line.begin("loose", 60.0, size=2.0)
+    photodiodes.send_request()
+    time.run_until(time.now_s() + 0.1)
+
+    volts = photodiodes.receive().volts
+    assert volts[2] == 0.0
+    assert np.count_nonzero(volts) == 3
 
 
 def test_photodiodes_that_refuse_a_request_say_so(time, plant, does):

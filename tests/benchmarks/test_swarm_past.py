@@ -142,6 +142,15 @@ FOUND = {
         ),
         "an experiment ends",
     ),
+    "travel-cuts-off": (
+        plan(
+            *[gives(2.0 * number, None) for number in range(6)],
+            Strike(at_s=24.0, device="metrology photodiodes", fault="loose", size=1.0, lasts_s=1.5),
+            duration_s=36.0,
+            rig="fit-testbed.toml",
+        ),
+        "a loop that waited goes on at its star",
+    ),
     "jog-in-off": (
         plan(
             gives(0.1, Standby()),

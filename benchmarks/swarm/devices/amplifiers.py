@@ -5,8 +5,8 @@ A drive keeps its last velocity until it misses the master's heartbeat.
 A CANopen drive that misses its master stops with a fault. The I/O station of analogue amplifiers drops the
 enable lines until the next write. An Ensemble has no such watchdog, and turns until it reaches its own limits.
 
-Known limitations: a drive without its master stops at once, without a ramp; a reset takes no time; only the
-encoder of azimuth is ever wrong.
+Known limitations: a drive without its master stops at once, without a ramp; a reset takes no time; one encoder
+at a time is wrong, that of azimuth reads too much and that of elevation too little.
 """
 
 from __future__ import annotations
@@ -276,7 +276,11 @@ class SwarmAmplifiers:
         ):
             return reading  # as at nearly every period
         (az_rad, el_rad), (zero_az_rad, zero_el_rad) = reading.position_rad, self.zero_rad
-        position_rad = az_rad - zero_az_rad + (wrong_rad or 0.0), el_rad - zero_el_rad
+        if wrong_rad is not None and wrong_rad < 0.0:
+            el_rad += wrong_rad
+        elif wrong_rad is not None:
+            az_rad += wrong_rad
+        position_rad = az_rad - zero_az_rad, el_rad - zero_el_rad
         return ServoReading(reading.time_s, position_rad, has_power, self.fault)
 
     def _hear(self, velocity_rad_s: AzEl) -> ServoReading:
