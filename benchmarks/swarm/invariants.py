@@ -479,7 +479,8 @@ class Invariants:
         """Whether a loop that waited has its siderostat back at its star, if it can be there."""
         since_s = self._waits_since_s.pop(name, None)
         away_px = self._off_frame_px(name)
-        if since_s is None or away_px <= _RETURNS_PX or self._supervisor is None:
+        lost = _RETURNS_PX < away_px < math.inf
+        if since_s is None or not lost or self._supervisor is None:
             return
         loop = self._supervisor.stellar_loops[name]
         turned_by = [name, *filter(None, [self._stellar_loops[name].link])]
@@ -490,7 +491,7 @@ class Invariants:
         )
         at_its_end = np.abs(loop.siderostat.setpoint_rad).max() >= loop.siderostat.travel_rad
         is_expected = loop.star_finder.estimator.origin_px is not None
-        if is_expected and not misled and not at_its_end:
+        if is_expected and not (misled or at_its_end or loop.interlocks.holds):
             self.violated(
                 "a loop that waited goes on at its star",
                 f"{name}: {away_px:.0f} px from it after {waited_s:.1f} s",

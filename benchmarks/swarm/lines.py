@@ -39,8 +39,7 @@ Amplifiers detect a fault of their own, motors do not move, or an encoder reads 
 has tripped: its outputs are at their safe voltages, and it refuses every request. A stack has the highest
 voltage, or the limit switch is at another voltage. The camera repeats an image, loses half of its frames, or
 has all pixels at full scale. Photodiodes are at the end of their range, or one of them is loose and reads 0 V.
-The hexapod reports a wrong pose,
-accepts moves and does not move, or its servos are off.
+The hexapod reports a wrong pose, accepts moves and does not move, or its servos are off.
 """
 SILENCE = frozenset(FAULTS) - {"slow"}
 """Faults during which no answer arrives that makes sense."""

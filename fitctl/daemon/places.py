@@ -11,7 +11,7 @@ from typing import Self
 import msgspec
 
 from fitctl.files import read_regular
-from fitctl.logging.records import Place
+from fitctl.logging.records import MOST, Place
 from fitctl.text import UNDECODABLE
 
 FILE = "places.json"  # in the socket folder
@@ -39,11 +39,12 @@ class Places:
     def read(self) -> list[Place]:
         """What a supervisor that was killed left; nothing where there is none, or nothing that can be read."""
         try:
-            return msgspec.json.decode(
+            places = msgspec.json.decode(
                 read_regular(self._path, _MOST_BYTES), type=list[Place], strict=True
             )
         except (OSError, *UNDECODABLE):
             return []
+        return [place for place in places if _is_somewhere(place)]
 
     def write(self, places: Sequence[Place]) -> None:
         """Leave this; waits for nothing."""
@@ -71,3 +72,8 @@ class Places:
             ):  # the folder has vanished, or its disk is full: the place is a help, no need
                 new.write_bytes(msgspec.json.encode(self._wanted))
                 new.replace(self._path)
+
+
+def _is_somewhere(place: Place) -> bool:
+    numbers = [value for value in msgspec.structs.astuple(place) if isinstance(value, float)]
+    return all(abs(number) < MOST for number in numbers)

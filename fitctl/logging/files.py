@@ -39,8 +39,6 @@ DAMAGE = (
 MEND = "`fitctl log recover` saves what is sound into a new file"
 COPY = "copy"
 """Name of the metadata that a log has which was made from others."""
-MOST = 1e15
-"""Beyond all times and numbers that an instrument logs: what is not less was not recorded by fitctl."""
 
 
 # A chunk is logging.chunk_bytes and a record, at most; a few kilobytes can unpack to gigabytes.

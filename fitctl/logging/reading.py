@@ -25,9 +25,9 @@ from mcap_protobuf.decoder import DecoderFactory
 from numpy.typing import NDArray
 
 from fitctl.logging.errors import LogError
-from fitctl.logging.files import MOST, Described, opened, up_to_the_tear
+from fitctl.logging.files import Described, opened, up_to_the_tear
 from fitctl.logging.indexed import IndexedReader
-from fitctl.logging.records import Tick
+from fitctl.logging.records import MOST, Tick
 from fitctl.logging.schemas import TOPICS
 
 # By column: how it is gathered (a type code of the array module; texts in a list) and what it becomes.

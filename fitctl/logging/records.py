@@ -17,6 +17,8 @@ FailingDevice = Literal[
     "camera", "siderostat", "D/A", "D/A between frames", "injector", "piezo", "photodiodes"
 ]
 CAMERA: Final = "camera"
+MOST = 1e15
+"""Beyond all times and numbers that an instrument logs: what is not less was not recorded by fitctl."""
 
 
 class Record(msgspec.Struct, frozen=True, kw_only=True, tag=True):
@@ -231,8 +233,8 @@ class OutputsFound(Record, frozen=True, kw_only=True):
 class StarPlace(Record, frozen=True, kw_only=True):
     """Position of the star that a killed supervisor held: on the camera, with the loop's own stages at zero.
 
-    The motors are where they were then; without a link, those of its siderostat are at 0. By then, a star that
-    moves by itself had moved as far as the motors turn it by these angles.
+    The motors are where they were then; without a link, those of its siderostat are at 0. `moved_az_rad` and
+    `moved_el_rad` say how far the star had moved by itself, as angles of the motors; NaN is unknown.
     """
 
     loop: str
@@ -242,8 +244,9 @@ class StarPlace(Record, frozen=True, kw_only=True):
     siderostat_el_rad: float
     link_az_rad: float = 0.0
     link_el_rad: float = 0.0
-    moved_az_rad: float = 0.0
-    moved_el_rad: float = 0.0
+    moved_az_rad: float = math.nan
+    moved_el_rad: float = math.nan
+    rate_is_given: bool = False  # by `acquire`; else it is that of the rig file
     rate_az_sky_arcsec_s: float = 0.0
     rate_el_sky_arcsec_s: float = 0.0
 

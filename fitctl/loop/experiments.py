@@ -52,7 +52,7 @@ class Experiments:
         now_s: float,
     ) -> None:
         """Make these motions, from now on."""
-        held_rad = siderostat.setpoint_rad.copy()
+        held_rad = siderostat.wanted_rad
         self._motions = _Motions(drives, now_s, now_s + experiment_s(drives), held_rad)
         text = msgspec.json.encode(drives).decode()
         self._journal.record(

@@ -112,8 +112,16 @@ class Interlocks:
 
     @property
     def holds(self) -> bool:
-        """Whether what is tripped keeps the stages from following star or beam."""
-        return self.action in {"freeze", "flatten"}
+        """Whether what is tripped keeps the stages from following star or beam.
+
+        A row that resets itself does so in its own modes only: stages that stood still in a search would never
+        find the star again on whose light it waits.
+        """
+        return self.action in {"freeze", "flatten"} and any(
+            trip.action in {"freeze", "flatten"}
+            and (trip.reset == "hand" or self._mode in self._rules[trip.name].row.modes)
+            for trip in self.tripped
+        )
 
     def evaluate(self, mode: str, now_s: float, readings: Mapping[str, Reading]) -> list[Change]:
         """What trips and what is over, now, by the newest reading of each quantity.

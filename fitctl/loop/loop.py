@@ -146,7 +146,7 @@ class Loop(ABC):
     @property
     @abstractmethod
     def place(self) -> Place | None:
-        """Where its star or beam is, for a supervisor after this one; None where there is nothing to know."""
+        """Where its star or beam is, for a supervisor after this one; None if that is unknown."""
 
     @abstractmethod
     def recall(self, place: Any) -> None:

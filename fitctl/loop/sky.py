@@ -27,8 +27,6 @@ class Sky:
 
     Attributes
     ----------
-    rate_sky_arcsec_s : AxisPair or None
-        At which it moves now.
     turned_rad : array, shape (2,)
         How far it had moved at the last :meth:`read_at`.
     undone_rad : array, shape (2,)
@@ -38,7 +36,6 @@ class Sky:
     def __init__(self, scale: Scales, setpoint_period_s: float, now_s: float = 0.0) -> None:
         self._scale = scale
         self._period_s = setpoint_period_s
-        self.rate_sky_arcsec_s: AxisPair | None = None
         self._rate_rad_s = np.zeros(2)
         self._read_s = self._since_s = now_s
         self._before_rad = np.zeros(2)
@@ -47,11 +44,10 @@ class Sky:
 
     def move_at(self, rate_sky_arcsec_s: AxisPair | None) -> None:
         """Since it was last read, the star moves at this rate, or stands."""
-        self.rate_sky_arcsec_s = rate_sky_arcsec_s
         self._since_s, self._before_rad = self._read_s, self.turned_rad
         self._rate_rad_s = sky_rad_s(rate_sky_arcsec_s, self._scale)
 
-    def recall(self, time_s: float, turned_rad: Floats, rate_sky_arcsec_s: AxisPair) -> None:
+    def recall(self, time_s: float, turned_rad: Floats, rate_sky_arcsec_s: AxisPair | None) -> None:
         """By a time, shape (2,), it had moved so far, and it goes on at this rate."""
         self._read_s, self.turned_rad = time_s, turned_rad
         self.move_at(rate_sky_arcsec_s)

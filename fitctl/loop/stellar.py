@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -111,6 +112,10 @@ class StellarLoop(Loop):
         )
         self._rig_noise_px = sensor_noise_px(rig.camera, self.settings, self.settings.star_flux_dn)
         self._recalled: StarPlace | None = None  # until the devices are open
+        self._given_rate: AxisPair | None = None  # by the last acquire
+        self._recalled_rate: AxisPair | None = (
+            None  # by that of a supervisor before, until the next
+        )
         self._held_undone_rad = np.zeros(2)  # of link and sky, as an experiment began
         self._laws: dict[Mode, Callable[[Observation], None]] = {
             Mode.OFF: self._rest,
@@ -424,9 +429,12 @@ class StellarLoop(Loop):
     def _expect_rate(self, asked: Acquire) -> None:
         """From now on the star moves as a command says, or as the rig file does."""
         az, el = asked.rate_az_sky_arcsec_s, asked.rate_el_sky_arcsec_s
-        rate = self.settings.star_rate_sky_arcsec_s
+        self._given_rate, self._recalled_rate = self._recalled_rate, None
         if az is not None and el is not None:
-            rate = AxisPair(az=az, el=el)
+            self._given_rate = AxisPair(az=az, el=el)
+        elif asked.expected_az_sky_arcsec is not None:
+            self._given_rate = None  # the star of a command before a kill was another one
+        rate = self._given_rate or self.settings.star_rate_sky_arcsec_s
         if self.sky is None and rate is not None:
             now_s = self._clock.now_s()
             self.sky = Sky(self._scale, self._period_s, now_s)
@@ -594,7 +602,7 @@ class StellarLoop(Loop):
         if setpoint_rad is None:
             self.fire(Trigger.EXPERIMENT_DONE, "all motions done")
         else:
-            self.siderostat.move_to(setpoint_rad + self._undone_since_held())
+            self.siderostat.undo_to(setpoint_rad + self._undone_since_held())
 
     def _undone_since_held(self) -> Floats:
         """How far link and sky have moved the siderostat since an experiment began, shape (2,)."""
@@ -669,7 +677,7 @@ class StellarLoop(Loop):
     def _end_experiment(self) -> None:
         held_rad = self._experiments.end(self.mirror)
         if held_rad is not None and self.mode is not Mode.SAFE:
-            self.siderostat.move_to(held_rad + self._undone_since_held())
+            self.siderostat.undo_to(held_rad + self._undone_since_held())
 
     # ------------------------------------------------------------ for the supervisor
 
@@ -728,6 +736,7 @@ class StellarLoop(Loop):
         recalled, self._recalled = self._recalled, None
         if jumped:
             self._link_counts = False
+            self._recalled_rate = None
             self.star_finder.estimator.forget()
             self._report_event(
                 "warning", "encoders read elsewhere than before; the star's place is forgotten"
@@ -777,15 +786,15 @@ class StellarLoop(Loop):
             **self._moved_by(now_s),
         )
 
-    def _moved_by(self, time_s: float) -> dict[str, float]:
+    def _moved_by(self, time_s: float) -> dict[str, Any]:
         """How far its star has moved by itself by a time, and how fast it does: fields of a `StarPlace`."""
-        if self.sky is None:
-            return {}
-        rate = self.sky.rate_sky_arcsec_s or AxisPair(az=0.0, el=0.0)
-        moved_az_rad, moved_el_rad = self.sky.turned_at(time_s).tolist()
+        moved_rad = np.zeros(2) if self.sky is None else self.sky.turned_at(time_s)
+        moved_az_rad, moved_el_rad = moved_rad.tolist()
+        rate = self._given_rate or AxisPair(az=0.0, el=0.0)
         return {
             "moved_az_rad": moved_az_rad,
             "moved_el_rad": moved_el_rad,
+            "rate_is_given": self._given_rate is not None,
             "rate_az_sky_arcsec_s": rate.az,
             "rate_el_sky_arcsec_s": rate.el,
         }
@@ -796,14 +805,23 @@ class StellarLoop(Loop):
         self.servo.recall((place.siderostat_az_rad, place.siderostat_el_rad))
         if self.link is not None:
             self.link.recall((place.link_az_rad, place.link_el_rad))
-        moved_rad = np.array([place.moved_az_rad, place.moved_el_rad])
-        rate = AxisPair(az=place.rate_az_sky_arcsec_s, el=place.rate_el_sky_arcsec_s)
-        if moved_rad.any() or rate.az or rate.el:
-            if self.sky is None:
-                self.sky = Sky(self._scale, self._period_s, place.time_s)
-            self.sky.recall(place.time_s, moved_rad, rate)
+        self._recall_sky(place)
         self.star_finder.estimator.observe((place.az_px, place.el_px), (0.0, 0.0))
         self._link_counts = True
+
+    def _recall_sky(self, place: StarPlace) -> None:
+        """Expect the star to go on from where it had moved to by itself, if that is known."""
+        if place.rate_is_given:
+            given = AxisPair(az=place.rate_az_sky_arcsec_s, el=place.rate_el_sky_arcsec_s)
+            self._given_rate = self._recalled_rate = given
+        moved_rad = np.array([place.moved_az_rad, place.moved_el_rad])
+        rate = self._given_rate or self.settings.star_rate_sky_arcsec_s
+        if np.isnan(moved_rad).any():
+            return
+        if self.sky is None and (rate is not None or moved_rad.any()):
+            self.sky = Sky(self._scale, self._period_s, place.time_s)
+        if self.sky is not None:
+            self.sky.recall(place.time_s, moved_rad, rate)
 
     def release(self) -> None:
         """Send the D/A nothing more."""

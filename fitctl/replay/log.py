@@ -9,12 +9,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_type_hints
 
 from fitctl.config import Rig
 from fitctl.logging.copying import merge
 from fitctl.logging.errors import LogError
-from fitctl.logging.files import MOST
 from fitctl.logging.reading import (
     LogInfo,
     clock_of,
@@ -24,6 +23,7 @@ from fitctl.logging.reading import (
 )
 from fitctl.logging.records import (
     CAMERA,
+    MOST,
     AnyRecord,
     BeamPlace,
     CommandRecord,
@@ -66,6 +66,10 @@ _TICKS = {Tick, MetrologyTick}
 KINDS: set[Any] = _BEGIN | _BEFORE_TICK | _AT_THE_END | _TICKS | {FrameRecord}
 _TIMES = ("mid_exposure_s", "compute_s", "requested_s")  # of ticks
 _STACKS = ("stack1_v", "stack2_v", "stack3_v")
+_OF_PLACES = {
+    kind: [name for name, field_type in get_type_hints(kind).items() if field_type is float]
+    for kind in (StarPlace, BeamPlace)
+}
 # The newest field that a replay needs of each kind of tick, and what a log without it lacks.
 _NEEDED = {
     Tick: ("fsm_written_s", "have neither commands nor when voltages took effect"),
@@ -266,15 +270,15 @@ def _is_over(step: LoggedStep, record: Logged, powered: bool) -> bool:
 
 
 def _insist_on_numbers(info: LogInfo, topic: str, kind: Any, message: Any, rig: Rig) -> None:
-    """Refuse times that cannot be counted from, and outputs that no D/A has."""
-    names: Sequence[str] = _TIMES if kind in _TICKS else ()
+    """Refuse times that cannot be counted from, outputs that no D/A has, and places that are none."""
+    names: Sequence[str] = _TIMES if kind in _TICKS else _OF_PLACES.get(kind, ())
     has_outputs = kind is DevicesOpened and not message.error and message.loop in rig.stellar_loops
     if has_outputs:
         names = _STACKS
     for name in names:
         value = getattr(message, name, 0.0)
-        # The NaN of a time stands for what there was not.
-        if abs(value) >= MOST or (has_outputs and math.isnan(value)):
+        # The NaN of a tick's time stands for what there was not.
+        if abs(value) >= MOST or (kind not in _TICKS and math.isnan(value)):
             msg = (
                 f"{info.path}: {topic} is not as fitctl records it: {name} is {value:g}; name a log that "
                 "fitctl recorded"

@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.logging.errors import LogError
-from fitctl.logging.files import MEND, MOST
+from fitctl.logging.files import MEND
 from fitctl.logging.reading import HEADER, Columns, column_blocks
 from fitctl.logging.records import (
+    MOST,
     ControllerChange,
     DeviceHealth,
     Event,

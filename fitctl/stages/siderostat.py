@@ -53,29 +53,38 @@ class SiderostatStage:
         """Move the set-point by an angle on the sky, shape (2,)."""
         self.move_by(step_sky_arcsec / self._motor_sky_arcsec_per_rad)
 
+    @property
+    def wanted_rad(self) -> Floats:
+        """The set-point as :meth:`undo` would have it without an end of the travel, shape (2,)."""
+        return self.setpoint_rad + self._beyond_rad
+
     def move_by(self, step_rad: Floats) -> None:
         """Move the set-point by motor angles, shape (2,); what the travel cuts off is lost."""
         self._move(self.setpoint_rad + step_rad, self._beyond_rad)
 
-    def undo(self, step_rad: Floats) -> None:
-        """Move the set-point by motor angles, shape (2,), against what turns the star by a known angle.
-
-        What the travel's end cuts off is kept for the next call: when that turn goes back, the set-point comes
-        back to where it was.
-        """
-        wanted_rad = self.setpoint_rad + self._beyond_rad + step_rad
-        self._move(wanted_rad, _NOTHING)
-        self._beyond_rad = wanted_rad - self.setpoint_rad
-
     def move_to(self, setpoint_rad: Floats) -> None:
-        """Move the set-point, shape (2,), no farther than its travel."""
+        """Move the set-point, shape (2,), no farther than its travel; what the travel cuts off is lost."""
         self._beyond_rad = _NOTHING
         self._move(setpoint_rad, _NOTHING)
 
+    def undo(self, step_rad: Floats) -> None:
+        """Move the set-point by motor angles, shape (2,), against what turns the star by a known angle.
+
+        What the travel's end cuts off is kept for the next call: when that turn goes back, the set-point stays
+        at the end until it is wanted nearer.
+        """
+        self.undo_to(self.wanted_rad + step_rad)
+
+    def undo_to(self, wanted_rad: Floats) -> None:
+        """Move the set-point as :meth:`undo` does, but to a place, shape (2,)."""
+        self._move(wanted_rad, _NOTHING)
+        cut_off = self.wanted_fraction > 1.0
+        self._beyond_rad = wanted_rad - self.setpoint_rad if cut_off else _NOTHING
+
     def _move(self, setpoint_rad: Floats, beyond_rad: Floats) -> None:
-        az_rad, el_rad = (setpoint_rad + beyond_rad).tolist()
         most_rad = self.travel_rad
+        az_rad, el_rad = (setpoint_rad + beyond_rad).tolist()
         self.wanted_fraction = max(abs(az_rad), abs(el_rad)) / most_rad
-        within = self.wanted_fraction <= 1.0
+        within = self.wanted_fraction <= 1.0 and beyond_rad is _NOTHING
         self.setpoint_rad = setpoint_rad if within else np.clip(setpoint_rad, -most_rad, most_rad)
         self.servo.move_to(self.setpoint_rad)

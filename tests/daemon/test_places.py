@@ -1,5 +1,6 @@
 """The file from which a supervisor knows where stars and beams were when the one before it was killed."""
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,6 +17,8 @@ PLACE = StarPlace(
     siderostat_el_rad=-2.5,
     link_az_rad=0.25,
     link_el_rad=-12.0,
+    moved_az_rad=0.0,
+    moved_el_rad=0.0,
 )
 BEAM = BeamPlace(
     time_s=5.0,
@@ -73,6 +76,14 @@ def test_one_that_ends_by_an_error_leaves_what_it_knew(tmp_path):
         raise RuntimeError
 
     assert Places(tmp_path).read() == [PLACE, BEAM]
+
+
+@pytest.mark.parametrize("field", ["time_s", "az_px", "rate_az_sky_arcsec_s"])
+def test_a_place_that_is_nowhere_is_left_out(tmp_path, field):
+    nowhere = msgspec.structs.replace(PLACE, **{field: 1e16})
+    (tmp_path / FILE).write_bytes(msgspec.json.encode([nowhere, BEAM]))
+
+    assert Places(tmp_path).read() == [BEAM]
 
 
 @given(st.binary(max_size=200))

@@ -7,6 +7,7 @@ from fitctl.config import default_rig_path, load_rig
 from fitctl.logging.records import Event, ModeChange, Overlap, Tick
 from fitctl.messages.commands import (
     Acquire,
+    Experiment,
     Off,
     Recover,
     Release,
@@ -16,6 +17,7 @@ from fitctl.messages.commands import (
     Stop,
 )
 from fitctl.messages.modes import Mode
+from fitctl.model.drives import standstill
 from fitctl.simulation.simulation import Simulation
 from fitctl.simulation.statistics import true_residual_rms
 
@@ -409,6 +411,7 @@ def test_a_photodiode_that_comes_loose_for_a_second_turns_the_left_siderostat_li
     one.run(2.0)
     metrology, siderostat = one.loop(METROLOGY), one.loop(LEFT).siderostat
     siderostat.travel_rad = travel_rad
+    assert travel_rad > np.abs(siderostat.setpoint_rad).max()
     photodiodes, before_rad = metrology._photodiodes, siderostat.setpoint_rad
     one.records.clear()
     metrology._photodiodes = LooseDiode(photodiodes, index=1)
@@ -457,3 +460,35 @@ def test_a_link_that_turns_beyond_the_left_siderostats_travel_and_back_leaves_it
         farthest = max(farthest, siderostat.wanted_fraction)
     assert farthest > 1.3
     assert siderostat.setpoint_rad == pytest.approx(before_rad, abs=0.2)
+
+
+def test_an_experiment_meanwhile_changes_nothing_of_that():
+    one = Testbed().held()
+    one.run(2.0)
+    siderostat = one.loop(LEFT).siderostat
+    before_rad = siderostat.setpoint_rad
+    one.swing(0.5)
+    siderostat.travel_rad = np.abs(before_rad).max() + 0.1
+    one.run(0.5)
+    assert siderostat.wanted_fraction > 1.3
+    assert one.command(Experiment(loop=LEFT, name="rest", drives=standstill(0.2))).accepted
+    one.run(1.5)
+    assert one.first_change(LEFT, trigger="EXPERIMENT_DONE")
+    assert siderostat.setpoint_rad == pytest.approx(before_rad, abs=0.2)
+
+
+def test_a_frozen_loop_that_lost_its_star_finds_it_again():
+    one = Testbed('interlocks.flux_low.action="freeze"').held()
+    one.run(1.0)
+    scene = one.simulation.camera._scene
+    light_dn = scene._flux_dn
+    scene._flux_dn = light_dn * 0.6
+    one.run(2.0)
+    assert one.loop(LEFT).interlocks.holds
+    one.laser(0.0)
+    one.drift(1.0)
+    one.run(8.0)  # the star is then beside the frame
+    one.drift(0.0)
+    one.laser(1.0)
+    scene._flux_dn = light_dn
+    one.until(metrology=Mode.LOCKED, left=Mode.VERNIER)

@@ -337,7 +337,9 @@ COURSES = {
     "the D/A's own watchdog": (a_mirror_that_the_watchdog_moves, [SOON], {"FAULT", "IN_REACH"}),
     "a star of a killed supervisor": (a_star_of_a_killed_supervisor(), [], {"IN_REACH"}),
     "a moving star of a killed supervisor": (
-        a_star_of_a_killed_supervisor(moved_az_rad=0.3, rate_el_sky_arcsec_s=-0.2),
+        a_star_of_a_killed_supervisor(
+            moved_az_rad=0.3, moved_el_rad=0.0, rate_is_given=True, rate_el_sky_arcsec_s=-0.2
+        ),
         [],
         {"IN_REACH"},
     ),

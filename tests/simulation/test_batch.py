@@ -1,6 +1,7 @@
 """The compiled batch makes the very runs that the simulation makes."""
 
 import math
+from itertools import groupby
 
 import numpy as np
 import pytest
@@ -397,27 +398,6 @@ def assert_same_loops(simulation, samples, run):
             ],
             id="turned",
         ),
-        pytest.param(
-            [
-                "collector.motion.kind=still",
-                "plant.loops.metrology.air_path.rms_sky_arcsec=60.0",
-                "loops.metrology.acquisition.search_again_pause_s=0.2",
-                "plant.loops.left.star_rate_sky_arcsec_s={az=8.0, el=5.0}",
-                "loops.left.star_rate_sky_arcsec_s={az=8.0, el=5.0}",
-            ],
-            id="beam out of reach and back, and one star moves",
-        ),
-        pytest.param(
-            [
-                "collector.motion.kind=sine",
-                "collector.motion.frequency_hz=0.2",
-                "collector.motion.amplitude_mm=2.4",
-                "loops.left.siderostat.travel_sky_arcsec=40.0",
-                "loops.left.acquisition.search_radius_sky_arcsec=30.0",
-                "plant.loops.left.star_offset_sky_arcsec_max=5.0",
-            ],
-            id="beyond the left siderostat's travel and back",
-        ),
     ],
 )
 def test_all_loops_of_the_testbed_make_the_same_run(overrides):
@@ -427,6 +407,43 @@ def test_all_loops_of_the_testbed_make_the_same_run(overrides):
 
     assert run.ended == DONE
     assert_same_loops(simulation, samples, run)
+
+
+def test_a_beam_that_is_pulled_in_again_while_its_star_moves_makes_the_same_run():
+    rig = rig_of_testbed(
+        "collector.motion.start_s=13.0",
+        "collector.motion.kind=still",
+        "plant.loops.metrology.air_path.rms_sky_arcsec=80.0",
+        "loops.metrology.acquisition.search_again_pause_s=0.2",
+        "plant.loops.left.star_rate_sky_arcsec_s={az=8.0, el=5.0}",
+        "loops.left.star_rate_sky_arcsec_s={az=8.0, el=5.0}",
+    )
+
+    simulation, samples, run = both_of_all(rig, 1, 19.0)
+
+    assert run.ended == DONE
+    assert_same_loops(simulation, samples, run)
+    modes = [mode for mode, _ in groupby(run.loops["metrology"].ticks["mode"].tolist())]
+    assert [int(Mode.LOCKED), int(Mode.COARSE), int(Mode.LOCKED)] == modes[-3:]
+
+
+def test_a_link_that_turns_beyond_the_own_travel_and_back_makes_the_same_run():
+    rig = rig_of_testbed(
+        "collector.motion.start_s=13.0",
+        "collector.motion.kind=sine",
+        "collector.motion.frequency_hz=0.2",
+        "collector.motion.amplitude_mm=2.4",
+        "loops.left.siderostat.travel_sky_arcsec=40.0",
+        "loops.left.acquisition.search_radius_sky_arcsec=30.0",
+        "plant.loops.left.star_offset_sky_arcsec_max=5.0",
+    )
+
+    simulation, samples, run = both_of_all(rig, 1, 19.0)
+
+    assert run.ended == DONE
+    assert_same_loops(simulation, samples, run)
+    beyond_rad = run.loops["left"].ticks["beyond_rad"]
+    assert np.count_nonzero(beyond_rad.any(axis=1)) > 20
 
 
 def test_a_course_from_a_file_makes_the_same_run(tmp_path):

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.stages.siderostat import SiderostatStage
@@ -36,7 +38,7 @@ def test_the_servo_is_given_no_setpoint_beyond_the_travel(stage):
 def test_a_turn_that_is_undone_beyond_the_travels_end_and_goes_back_leaves_the_setpoint_where_it_was(
     stage,
 ):
-    stage.move_to(np.array([1.0, 2.0]))
+    stage.undo_to(np.array([1.0, 2.0]))
     for step in steps(0.7 * stage.travel_rad, 0.7 * stage.travel_rad, -0.2 * stage.travel_rad):
         stage.undo(step)
         assert np.abs(stage.servo.setpoint_rad).max() <= stage.travel_rad
@@ -44,6 +46,29 @@ def test_a_turn_that_is_undone_beyond_the_travels_end_and_goes_back_leaves_the_s
     assert stage.wanted_fraction > 1.1
     stage.undo(*steps(-1.2 * stage.travel_rad))
     assert stage.servo.setpoint_rad == pytest.approx([1.0, 2.0], abs=1e-9)
+
+
+def test_a_place_beyond_the_travel_that_is_undone_is_wanted_until_the_next(stage):
+    stage.undo_to(np.array([1.5, 0.0]) * stage.travel_rad)
+    assert stage.wanted_rad.tolist() == [1.5 * stage.travel_rad, 0.0]
+    stage.undo_to(np.zeros(2))
+    assert stage.wanted_rad.tolist() == [0.0, 0.0]
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(["move_by", "move_to", "undo", "undo_to"]),
+            st.tuples(st.floats(-300.0, 300.0), st.floats(-300.0, 300.0)),
+        ),
+        max_size=8,
+    )
+)
+def test_whatever_is_asked_for_no_setpoint_is_beyond_the_travel(moves):
+    one = SiderostatStage(load_rig(default_rig_path()), "right", Servo())
+    for method, rad in moves:
+        getattr(one, method)(np.array(rad))
+        assert np.abs(one.servo.setpoint_rad).max() <= one.travel_rad
 
 
 def test_the_steps_of_a_control_law_are_not_made_up_for(stage):

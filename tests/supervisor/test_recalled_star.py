@@ -11,6 +11,7 @@ from instruments.simulated import darken, events_of, failing, mode_of, until
 from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.choose import design_for
 from fitctl.drivers.interface import DeviceFault
+from fitctl.logging.records import BeamPlace, StarPlace
 from fitctl.messages.commands import Acquire, Off, Standby, Stop
 from fitctl.messages.modes import Mode
 from fitctl.model.optics import scales
@@ -288,38 +289,81 @@ def test_a_beam_that_was_not_found_is_searched_for_where_it_was():
 @pytest.mark.long
 def test_encoders_that_lost_their_zero_lead_to_no_place_of_a_search_for_a_beam():
     simulation, _ = killed_while_the_link_searches()
+    assert simulation.supervisor.loops["metrology"].place is not None
     lose_zero(simulation, "metrology")
     simulation.command(Standby())
 
     assert simulation.supervisor.loops["metrology"].place is None
 
 
-RATE = "plant.loops.right.star_rate_sky_arcsec_s={az=0.4, el=-0.3}"
+FAST = {"rate_az_sky_arcsec_s": 12.0, "rate_el_sky_arcsec_s": -9.0}
+TRUE = "plant.loops.right.star_rate_sky_arcsec_s={az=12.0, el=-9.0}"
+
+
+@pytest.fixture
+def follows(simulate_with):
+    """A star whose rate a command gave is held, and its supervisor killed; the next one is in STANDBY."""
+    simulation = simulate_with(TRUE, star_offset_px=(10.0, -6.0))
+    simulation.command(Standby())
+    simulation.run(0.2)
+    assert simulation.command(Acquire(**FAST)).accepted
+    until(simulation, Mode.VERNIER)
+    simulation.run(10.0)
+    killed(simulation)
+    simulation.run(5.0)
+    killed(simulation)  # what was not used yet is passed on
+    simulation.command(Standby())
+    simulation.run(0.2)
+    return simulation
 
 
 @pytest.mark.long
-def test_a_star_whose_rate_a_command_gave_goes_on_to_move_for_the_next_supervisor(simulate_with):
-    simulation = simulate_with(RATE, star_offset_px=(10.0, -6.0))
-    given = Acquire(rate_az_sky_arcsec_s=0.4, rate_el_sky_arcsec_s=-0.3)
-    simulation.command(Standby())
-    simulation.run(0.2)
-    assert simulation.command(given).accepted
-    until(simulation, Mode.VERNIER)
-    simulation.run(60.0)  # 30 arcsec
-
-    (place,) = killed(simulation)
-    simulation.run(20.0)
-    (later,) = simulation.supervisor.places
-    killed(simulation)
-    simulation.command(Standby())
-    simulation.run(0.2)
-    simulation.command(Acquire())
-
-    assert place.rate_az_sky_arcsec_s == later.rate_az_sky_arcsec_s == 0.4
-    assert later.moved_az_rad > 1.2 * place.moved_az_rad
-    until(simulation, Mode.VERNIER, limit_s=10.0)
-    target_px = simulation.supervisor.stellar_loops["right"].target_px
-    simulation.run(30.0)
-    spot_px = simulation.plants["right"].spots_px(simulation.clock.now_s())[0, 0]
+def test_a_star_whose_rate_a_command_gave_is_followed_by_the_next_supervisor(follows):
+    assert follows.command(Acquire()).accepted
+    until(follows, Mode.VERNIER, limit_s=10.0)
+    follows.run(10.0)
+    spot_px = follows.plants["right"].spots_px(follows.clock.now_s())[0, 0]
+    target_px = follows.supervisor.stellar_loops["right"].target_px
     assert spot_px == pytest.approx(target_px, abs=0.15)
-    assert mode_of(simulation) is Mode.VERNIER
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("times", [1, 2])
+def test_a_rate_of_before_the_kill_holds_for_one_search(follows, times):
+    for _ in range(times):
+        assert follows.command(Acquire()).accepted
+    (place,) = follows.supervisor.places
+    assert place.rate_is_given is (times == 1)
+
+
+@pytest.mark.long
+def test_a_command_that_gives_a_place_means_another_star(follows):
+    other = Acquire(expected_az_sky_arcsec=50.0, expected_el_sky_arcsec=0.0)
+    assert follows.command(other).accepted
+    loop = follows.supervisor.stellar_loops["right"]
+    before_rad = loop.sky.turned_at(follows.clock.now_s())
+    assert loop.sky.turned_at(follows.clock.now_s() + 9.0).tolist() == before_rad.tolist()
+
+
+@pytest.mark.long
+def test_a_rig_file_s_rate_that_came_after_the_kill_counts_from_the_kill_on(simulate_with):
+    simulation = simulate_with(star_offset_px=(10.0, -6.0))
+    held_arcsec = searches_elsewhere(simulation)
+    rate = "loops.right.star_rate_sky_arcsec_s={az=1.0, el=0.0}"
+    simulation.rig = load_rig(default_rig_path(), [rate])
+    before_s = simulation.clock.now_s()
+    killed(simulation)
+
+    moved_arcsec = simulation.clock.now_s() - before_s
+    assert search_from_arcsec(simulation, held_arcsec) < 40.0 + moved_arcsec
+
+
+def test_places_of_unknown_loops_or_of_another_kind_are_ignored(simulate_with):
+    simulation = simulate_with(star_offset_px=(10.0, -6.0))
+    nowhere = {"siderostat_az_rad": 1.0, "siderostat_el_rad": 1.0}
+    beam = BeamPlace(time_s=0.0, loop="right", search_az_rad=9.0, search_el_rad=9.0, **nowhere)
+    star = StarPlace(time_s=0.0, loop="middle", az_px=1.0, el_px=1.0, **nowhere)
+
+    simulation.supervisor.recall([beam, star])
+
+    assert simulation.supervisor.places == []

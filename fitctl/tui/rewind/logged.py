@@ -17,10 +17,10 @@ import msgspec
 
 from fitctl.config import is_name
 from fitctl.logging.errors import LogError
-from fitctl.logging.files import MOST
 from fitctl.logging.reading import LogMessage, clock_of
 from fitctl.logging.records import (
     CAMERA,
+    MOST,
     AnyRecord,
     DeviceHealth,
     Event,

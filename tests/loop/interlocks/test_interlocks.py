@@ -83,6 +83,20 @@ def test_a_row_trips_once_it_was_out_of_range_for_its_time():
     assert change.trip.reason.endswith(QUANTITIES[FIRST].remedy)
 
 
+@pytest.mark.parametrize(("reset", "holds_in_a_search"), [("itself", False), ("hand", True)])
+def test_a_row_that_resets_itself_holds_the_stages_in_its_own_modes_only(reset, holds_in_a_search):
+    course = Course(table(action="freeze", reset=reset))
+    course.show([2.0] * 10)
+    assert course.interlocks.holds
+
+    course.show([None], mode="ACQUISITION")
+    assert course.tripped == ["it"]
+    assert course.interlocks.holds is holds_in_a_search
+
+    course.show([None])
+    assert course.interlocks.holds
+
+
 def test_a_value_back_in_range_starts_the_time_anew():
     course = Course(table())
 
