@@ -87,6 +87,8 @@ _TO_THE_END = 0.1  # fraction of runs in which a siderostat is jogged to the end
 _JOG_ARCSEC, _JOGS = 100.0, 14  # each, and so many
 _COLLECTOR = 0.4  # fraction of the testbed's runs in which its collector is moved on purpose
 _LOOP_FAILS = 0.3  # fraction of these in which a loop fails, in place of a stop
+_LOOSE = 0.4  # fraction of the testbed's runs in which photodiodes come loose,
+_LOOSE_S = 0.2, 3.0  # and for how long
 _REFERENCED_S = 7.0  # until a reference move has ended
 _BURST, _BURST_S = 0.4, 0.05  # fraction of happenings that follow another at once, and mean delay
 
@@ -307,6 +309,8 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
         settings += learning(rig) if random.random() < _LEARNS else []
     if random.random() < _KILLED_SEARCHES:
         happenings += _killed_search(random, random.uniform(*_HELD_S))
+    if "metrology" in loops and random.random() < _LOOSE:
+        happenings += _loose_photodiode(random, duration_s)
     happenings.sort(key=lambda happening: happening.at_s)
     console_loss = random.random() ** 2 if random.random() < _CONSOLE_SLOW else 0.0
     remote_consoles = random.randint(1, 3) if random.random() < _REMOTE else 0
@@ -526,6 +530,20 @@ def _moved_collector(random: Random, at_s: float, loops: tuple[str, ...]) -> lis
         *([Order(at_s=at_s, who=who, command=Stop())] if random.random() < _BURST else []),
         Order(at_s=begins_s, who=who, command=MoveCollector(action="start")),
         ends,
+    ]
+
+
+def _loose_photodiode(random: Random, duration_s: float) -> list[Happening]:
+    """A photodiode comes loose up to four times, each for so long that the beam is pulled in again."""
+    return [
+        Strike(
+            at_s=random.uniform(_HELD_S[0], duration_s),
+            device="metrology photodiodes",
+            fault="loose",
+            lasts_s=random.uniform(*_LOOSE_S),
+            size=_drawn_size(random, "metrology photodiodes", "loose"),
+        )
+        for _ in range(random.randint(1, 4))
     ]
 
 

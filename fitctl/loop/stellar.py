@@ -113,9 +113,7 @@ class StellarLoop(Loop):
         self._rig_noise_px = sensor_noise_px(rig.camera, self.settings, self.settings.star_flux_dn)
         self._recalled: StarPlace | None = None  # until the devices are open
         self._given_rate: AxisPair | None = None  # by the last acquire
-        self._recalled_rate: AxisPair | None = (
-            None  # by that of a supervisor before, until the next
-        )
+        self._recalled_rate: AxisPair | None = None  # by one before a kill, until the next
         self._held_undone_rad = np.zeros(2)  # of link and sky, as an experiment began
         self._laws: dict[Mode, Callable[[Observation], None]] = {
             Mode.OFF: self._rest,

@@ -158,3 +158,16 @@ def test_plans_have_every_sky_and_learners():
         ' loops.right.learn="on"',
     ):
         assert key in f" {settings}"
+
+
+def test_photodiodes_come_loose_for_longer_than_a_beam_out_of_reach_is_held():
+    loose = [
+        happening
+        for seed in range(20)
+        for happening in drawn_plan(Random(seed), seed, "fit-testbed.toml").happenings
+        if isinstance(happening, Strike) and happening.fault == "loose" and happening.lasts_s > 0.2
+    ]
+
+    assert len(loose) > 5
+    assert {strike.device for strike in loose} == {"metrology photodiodes"}
+    assert {strike.size for strike in loose} == {0.0, 1.0, 2.0, 3.0}
