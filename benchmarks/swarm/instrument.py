@@ -20,7 +20,7 @@ from benchmarks.swarm.devices.amplifiers import SwarmAmplifiers
 from benchmarks.swarm.devices.hexapod import SwarmHexapod
 from benchmarks.swarm.devices.mirror import SwarmDac, SwarmPiezo
 from benchmarks.swarm.devices.sensors import SwarmCamera, SwarmPhotodiodes
-from benchmarks.swarm.invariants import ANSWERED_ONCE, Invariants
+from benchmarks.swarm.invariants import ANSWERED_ONCE, Invariants, turned_by
 from benchmarks.swarm.lines import Bus, Line
 from benchmarks.swarm.plan import (
     ClockStep,
@@ -358,9 +358,8 @@ class Instrument:
         if isinstance(record, ModeChange):
             self.modes[record.target] = self.modes.get(record.target, 0) + 1
             if record.target == Mode.COARSE.name and record.loop in self.rig.stellar_loops:
-                link = self.rig.stellar_loops[record.loop].link
-                turned_by = [self.amplifiers[name] for name in (record.loop, link) if name]
-                if not any(each.line.was_wrong("encoder", _MISLED_S) for each in turned_by):
+                turning = [self.amplifiers[name] for name in turned_by(self.rig, record.loop)]
+                if not any(each.line.was_wrong("encoder", _MISLED_S) for each in turning):
                     self.found_s.setdefault(record.loop, record.time_s)
         if self.found_s and self.camera.line.was_wrong("frozen", _MISLED_S):
             self.found_s.clear()  # a repeated image has a star where none is: its place may be wrong
@@ -498,8 +497,8 @@ class Instrument:
 
     def _forget_places(self, name: str) -> None:
         """The places of the stars that a loop's siderostat turns are not to be relied on."""
-        for star, loop in self.rig.stellar_loops.items():
-            if name in {star, loop.link}:
+        for star in self.rig.stellar_loops:
+            if name in turned_by(self.rig, star):
                 self.found_s.pop(star, None)
 
     def _empty_disk(self) -> None:

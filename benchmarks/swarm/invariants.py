@@ -17,6 +17,7 @@ from benchmarks.swarm.motion import AT_REST, STUCK_S, WELL_S, Motion
 from fitctl.clock import Clock
 from fitctl.config import Rig
 from fitctl.controllers.pair import LEARNT
+from fitctl.drivers.interface import AzEl
 from fitctl.logging.records import (
     AnyRecord,
     ControllerChange,
@@ -85,6 +86,12 @@ _SURELY = 1.2  # times the following error limit: a servo that is behind so far 
 _COLLECTOR_RESTS_S = 3.0
 _SEQUENCE_ENDS_S = 15.0
 _EXPERIMENT_ENDS_S = 1.0  # after its last motion
+
+
+def turned_by(rig: Rig, name: str) -> list[str]:
+    """The loops whose siderostats turn the light of a loop: its own, and that of its link."""
+    loop = rig.stellar_loops.get(name)
+    return [name] if loop is None or loop.link is None else [name, loop.link]
 
 
 class Violation(NamedTuple):
@@ -453,8 +460,7 @@ class Invariants:
         if not now_s - self._checked_s.get(name, -math.inf) >= _CHECKED_S:
             return
         self._checked_s[name] = now_s
-        part = self._plant.stellar_loops[name]
-        own_az_px, own_el_px = part.spots_at_px(self._plant.row(now_s))[0, 0].tolist()
+        own_az_px, own_el_px = self._own_star_px(name, now_s)
         away_px = math.hypot(tick.star_az_px - own_az_px, tick.star_el_px - own_el_px)
         follows = tick.mode in _FOLLOWING and name not in self._pointed_at
         # The star of an image that is repeated is where the own one was, and is followed there.
@@ -483,11 +489,10 @@ class Invariants:
         if since_s is None or not lost or self._supervisor is None:
             return
         loop = self._supervisor.stellar_loops[name]
-        turned_by = [name, *filter(None, [self._stellar_loops[name].link])]
         waited_s = self._clock.now_s() - since_s
         misled = any(
             self._lines[f"{one} siderostat"].was_wrong("encoder", waited_s + _MOST_WRONG_S)
-            for one in turned_by
+            for one in turned_by(self._rig, name)
         )
         at_its_end = np.abs(loop.siderostat.setpoint_rad).max() >= loop.siderostat.travel_rad
         is_expected = loop.star_finder.estimator.origin_px is not None
@@ -501,9 +506,15 @@ class Invariants:
         """From the middle of the frame to the own star of a loop; infinite if the loop follows none."""
         if self._supervisor is None or self._supervisor.loops[name].mode not in FOLLOWING:
             return math.inf
-        part, camera = self._plant.stellar_loops[name], self._rig.camera
-        az_px, el_px = part.spots_at_px(self._plant.row(self._clock.now_s()))[0, 0].tolist()
+        camera = self._rig.camera
+        az_px, el_px = self._own_star_px(name, self._clock.now_s())
         return math.hypot(az_px - camera.width_px / 2, el_px - camera.height_px / 2)
+
+    def _own_star_px(self, name: str, time_s: float) -> AzEl:
+        """Where the star of a loop truly is on the camera."""
+        part = self._plant.stellar_loops[name]
+        az_px, el_px = part.spots_at_px(self._plant.row(time_s))[0, 0].tolist()
+        return az_px, el_px
 
     def _camera_well(self) -> bool:
         """Nothing has been wrong with the camera's line for a while, and it loses no frames.
@@ -547,13 +558,12 @@ class Invariants:
         now_s = self._clock.now_s()
         if reason.startswith("interlock") or now_s - self.motion.stall_ended_s < _CAUSE_S:
             return True
-        link = self._rig.stellar_loops[name].link if name in self._stellar_loops else None
         return any(
             line.is_bad
             or line.wrong
             or now_s - max(line.healed_s, self._struck_s.get(device, -math.inf)) < _CAUSE_S
             for device, line in self._lines.items()
-            if device.partition(" ")[0] in {name, link, "camera", "hexapod"}
+            if device.partition(" ")[0] in {*turned_by(self._rig, name), "camera", "hexapod"}
             and reason.startswith(line.device)
         )
 

@@ -112,6 +112,12 @@ def to_message(record: AnyRecord, wall_ns: int) -> Message:
     return MESSAGES[type(record)](**msgspec.structs.asdict(record))
 
 
+def fields_of(kind: type[AnyRecord], message: Message) -> dict[str, Any]:
+    """What a message has of the fields of a record; one of an older version lacks some."""
+    there = message.DESCRIPTOR.fields_by_name
+    return {name: getattr(message, name) for name in kind.__struct_fields__ if name in there}
+
+
 def run_metadata(info: RunInfo) -> dict[str, dict[str, str]]:
     """A run's description as MCAP metadata: name to texts. Floats read back exactly."""
     metadata = {

@@ -30,10 +30,10 @@ from fitctl.logging.records import (
     ModeChange,
     Overlap,
     PiezoReading,
-    Place,
     QuantityReading,
     Tick,
 )
+from fitctl.logging.schemas import fields_of
 from fitctl.loop.loop import Loop
 from fitctl.loop.metrology import MetrologyLoop
 from fitctl.loop.stellar import StellarLoop
@@ -177,7 +177,7 @@ class Replay:
                 self._supervisor.piezos[name].evaluate(_piezo_answer(failure))
         loop = self._supervisor.loops[name]
         for place in step.of(loop.place_kind, name):
-            loop.recall(_as_recorded(loop.place_kind, place))
+            loop.recall(loop.place_kind(**fields_of(loop.place_kind, place)))
 
     def _post(self, message: Any) -> None:
         try:
@@ -286,20 +286,11 @@ def _begin_s(step: LoggedStep) -> float:
     return step.begin[0].message.time_s if step.begin else math.nan
 
 
-def _as_recorded(kind: type[Place], message: Any) -> Place:
-    """A record as it was recorded; what a log of an older version does not have is as by default."""
-    given = {
-        name: getattr(message, name) for name in kind.__struct_fields__ if hasattr(message, name)
-    }
-    return kind(**given)
-
-
 def _piezo_answer(message: Any) -> Future:
     """A piezo amplifier's answer, or its error."""
     future: Future = Future()
     if hasattr(message, "error"):
         future.set_exception(logged_error(message.kind, message.error))
     else:
-        values = {name: getattr(message, name) for name in PiezoReading.__struct_fields__}
-        future.set_result(PiezoReading(**values))
+        future.set_result(PiezoReading(**fields_of(PiezoReading, message)))
     return future

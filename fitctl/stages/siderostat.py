@@ -60,12 +60,12 @@ class SiderostatStage:
 
     def move_by(self, step_rad: Floats) -> None:
         """Move the set-point by motor angles, shape (2,); what the travel cuts off is lost."""
-        self._move(self.setpoint_rad + step_rad, self._beyond_rad)
+        self._move(self.setpoint_rad + step_rad)
 
     def move_to(self, setpoint_rad: Floats) -> None:
         """Move the set-point, shape (2,), no farther than its travel; what the travel cuts off is lost."""
         self._beyond_rad = _NOTHING
-        self._move(setpoint_rad, _NOTHING)
+        self._move(setpoint_rad)
 
     def undo(self, step_rad: Floats) -> None:
         """Move the set-point by motor angles, shape (2,), against what turns the star by a known angle.
@@ -77,14 +77,14 @@ class SiderostatStage:
 
     def undo_to(self, wanted_rad: Floats) -> None:
         """Move the set-point as :meth:`undo` does, but to a place, shape (2,)."""
-        self._move(wanted_rad, _NOTHING)
-        cut_off = self.wanted_fraction > 1.0
-        self._beyond_rad = wanted_rad - self.setpoint_rad if cut_off else _NOTHING
+        self.move_to(wanted_rad)
+        if self.wanted_fraction > 1.0:
+            self._beyond_rad = wanted_rad - self.setpoint_rad
 
-    def _move(self, setpoint_rad: Floats, beyond_rad: Floats) -> None:
+    def _move(self, setpoint_rad: Floats) -> None:
         most_rad = self.travel_rad
-        az_rad, el_rad = (setpoint_rad + beyond_rad).tolist()
+        az_rad, el_rad = (setpoint_rad + self._beyond_rad).tolist()
         self.wanted_fraction = max(abs(az_rad), abs(el_rad)) / most_rad
-        within = self.wanted_fraction <= 1.0 and beyond_rad is _NOTHING
+        within = self.wanted_fraction <= 1.0 and self._beyond_rad is _NOTHING
         self.setpoint_rad = setpoint_rad if within else np.clip(setpoint_rad, -most_rad, most_rad)
         self.servo.move_to(self.setpoint_rad)

@@ -405,29 +405,28 @@ class LooseDiode:
 
 @pytest.mark.parametrize("travel_rad", [74.0, 1.0], ids=["far from its end", "near its end"])
 def test_a_photodiode_that_comes_loose_for_a_second_turns_the_left_siderostat_little_and_costs_no_star(
-    travel_rad,
+    held, travel_rad
 ):
-    one = Testbed().held()
-    one.run(2.0)
-    metrology, siderostat = one.loop(METROLOGY), one.loop(LEFT).siderostat
+    held.run(2.0)
+    metrology, siderostat = held.loop(METROLOGY), held.loop(LEFT).siderostat
     siderostat.travel_rad = travel_rad
     assert travel_rad > np.abs(siderostat.setpoint_rad).max()
     photodiodes, before_rad = metrology._photodiodes, siderostat.setpoint_rad
-    one.records.clear()
+    held.records.clear()
     metrology._photodiodes = LooseDiode(photodiodes, index=1)
-    one.run(1.0)
+    held.run(1.0)
     turned_rad = np.abs(siderostat.setpoint_rad - before_rad).max()
-    assert turned_rad * one.loop(LEFT).settings.siderostat.sky_arcsec_per_motor_rad < 60.0
+    assert turned_rad * held.loop(LEFT).settings.siderostat.sky_arcsec_per_motor_rad < 60.0
     metrology._photodiodes = photodiodes
-    one.until(metrology=Mode.LOCKED).run(3.0)
-    changes = [record for record in one.records if isinstance(record, ModeChange)]
+    held.until(metrology=Mode.LOCKED).run(3.0)
+    changes = [record for record in held.records if isinstance(record, ModeChange)]
     assert [(change.loop, change.target) for change in changes] == [
         (METROLOGY, "COARSE"),
         (METROLOGY, "LOCKED"),
     ]
     assert siderostat.setpoint_rad == pytest.approx(before_rad, abs=0.2)
-    rms_px = one.rms_px(LEFT, one.clock.now_s() - 1.0)
-    assert (rms_px < one.loop(LEFT).settings.requirement_px).all()
+    rms_px = held.rms_px(LEFT, held.clock.now_s() - 1.0)
+    assert (rms_px < held.loop(LEFT).settings.requirement_px).all()
 
 
 def test_a_star_that_moves_while_its_link_is_lost_is_held_again_without_a_search():
@@ -446,34 +445,32 @@ def test_a_star_that_moves_while_its_link_is_lost_is_held_again_without_a_search
 
 @pytest.mark.parametrize("amplitude_mm", [0.5, -0.5])
 def test_a_link_that_turns_beyond_the_left_siderostats_travel_and_back_leaves_it_where_it_was(
-    amplitude_mm,
+    held, amplitude_mm
 ):
-    one = Testbed().held()
-    one.run(2.0)
-    siderostat = one.loop(LEFT).siderostat
+    held.run(2.0)
+    siderostat = held.loop(LEFT).siderostat
     before_rad = siderostat.setpoint_rad
-    one.swing(amplitude_mm)  # 0.6 rad: the mirror makes up for what is beyond
+    held.swing(amplitude_mm)  # 0.6 rad: the mirror makes up for what is beyond
     siderostat.travel_rad = np.abs(before_rad).max() + 0.1
     farthest = 0.0
     for _ in range(100):
-        one.run(0.02)
+        held.run(0.02)
         farthest = max(farthest, siderostat.wanted_fraction)
     assert farthest > 1.3
     assert siderostat.setpoint_rad == pytest.approx(before_rad, abs=0.2)
 
 
-def test_an_experiment_meanwhile_changes_nothing_of_that():
-    one = Testbed().held()
-    one.run(2.0)
-    siderostat = one.loop(LEFT).siderostat
+def test_an_experiment_meanwhile_changes_nothing_of_that(held):
+    held.run(2.0)
+    siderostat = held.loop(LEFT).siderostat
     before_rad = siderostat.setpoint_rad
-    one.swing(0.5)
+    held.swing(0.5)
     siderostat.travel_rad = np.abs(before_rad).max() + 0.1
-    one.run(0.5)
+    held.run(0.5)
     assert siderostat.wanted_fraction > 1.3
-    assert one.command(Experiment(loop=LEFT, name="rest", drives=standstill(0.2))).accepted
-    one.run(1.5)
-    assert one.first_change(LEFT, trigger="EXPERIMENT_DONE")
+    assert held.command(Experiment(loop=LEFT, name="rest", drives=standstill(0.2))).accepted
+    held.run(1.5)
+    assert held.first_change(LEFT, trigger="EXPERIMENT_DONE")
     assert siderostat.setpoint_rad == pytest.approx(before_rad, abs=0.2)
 
 

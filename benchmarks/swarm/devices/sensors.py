@@ -171,8 +171,7 @@ class SwarmPhotodiodes(SimulatedPhotodiodes):
         reading = None if silent else super().receive()
         if reading is not None and self.line.is_wrong("saturated"):
             reading = reading._replace(volts=(self._range_v,) * 4)
-        loose = None if reading is None else self.line.wrong_by("loose")
-        if reading is not None and loose is not None:
+        if reading is not None and (loose := self.line.wrong_by("loose")) is not None:
             one, two, three, four = (
                 0.0 if number == loose else volt for number, volt in enumerate(reading.volts)
             )

@@ -198,6 +198,13 @@ def turn_by(b: Any, r: Any, az_rad: float, el_rad: float) -> None:
     )
 
 
+@compilable(inline=True)
+def limited(az: float, el: float, most: float) -> tuple[float, float]:
+    """``fitctl.loop.metrology.limited``."""
+    part = min(1.0, most / max(abs(az), abs(el), 1e-12))
+    return az * part, el * part
+
+
 @compilable()
 def hold_beam(b: Any, r: Any, duration_s: float) -> None:
     """``MetrologyLoop._pull_in`` and ``_hold_beam``."""
@@ -206,12 +213,10 @@ def hold_beam(b: Any, r: Any, duration_s: float) -> None:
     if r.mode == COARSE and has_beam:
         az_rad = pull_in_step(b.hold, az_rad, duration_s)
         el_rad = pull_in_step(b.hold, el_rad, duration_s)
-        most_rad = b.pull_in_rad_s * duration_s
-        part = min(1.0, most_rad / max(abs(az_rad), abs(el_rad), 1e-12))
-        turn_by(b, r, az_rad * part, el_rad * part)
+        az_rad, el_rad = limited(az_rad, el_rad, b.pull_in_rad_s * duration_s)
+        turn_by(b, r, az_rad, el_rad)
     elif r.mode == LOCKED and has_beam:
-        part = min(1.0, b.hold_most_rad / max(abs(az_rad), abs(el_rad), 1e-12))
-        az_rad, el_rad = az_rad * part, el_rad * part
+        az_rad, el_rad = limited(az_rad, el_rad, b.hold_most_rad)
         az_rad, r.rate_rad_s[0] = hold_step(b.hold, r.rate_rad_s[0], az_rad, duration_s)
         el_rad, r.rate_rad_s[1] = hold_step(b.hold, r.rate_rad_s[1], el_rad, duration_s)
         turn_by(b, r, az_rad, el_rad)

@@ -35,7 +35,7 @@ from fitctl.logging.records import (
     Snapshot,
     Tick,
 )
-from fitctl.logging.schemas import TOPICS
+from fitctl.logging.schemas import TOPICS, fields_of
 from fitctl.logging.seeking import SeekableLog
 from fitctl.messages.telemetry import LoopState, Telemetry, Unlogged
 from fitctl.text import UNDECODABLE, plain, plain_message
@@ -229,10 +229,7 @@ class LoggedRun:
             }
             values["message"] = getattr(message, "message", "")
         else:
-            there = message.DESCRIPTOR.fields_by_name
-            values = {
-                name: getattr(message, name) for name in kind.__struct_fields__ if name in there
-            }
+            values = fields_of(kind, message)
         for name, value in values.items():
             if isinstance(value, str):
                 values[name] = plain(value[:MOST_TEXT])

@@ -232,9 +232,7 @@ def test_all_drives_of_a_bus_act_and_are_read_at_one_sync(bench):
     periods(bench, STILL, STILL, STILL)
     readings = [None]
     for _ in range(50):  # a stall of the machine eats a period's answers
-        arrived = (
-            None not in readings
-        )  # what was sent before has reached the mock, which answered it
+        arrived = None not in readings  # the mock has heard, and answered, what was sent before
         del bench.frames[:]
         readings = bench.period(STILL, STILL, STILL)
         if arrived and None not in readings:
