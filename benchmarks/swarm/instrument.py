@@ -20,8 +20,9 @@ from benchmarks.swarm.devices.amplifiers import SwarmAmplifiers
 from benchmarks.swarm.devices.hexapod import SwarmHexapod
 from benchmarks.swarm.devices.mirror import SwarmDac, SwarmPiezo
 from benchmarks.swarm.devices.sensors import SwarmCamera, SwarmPhotodiodes
-from benchmarks.swarm.invariants import ANSWERED_ONCE, Invariants, turned_by
+from benchmarks.swarm.invariants import ANSWERED_ONCE, Invariants
 from benchmarks.swarm.lines import Bus, Line
+from benchmarks.swarm.own_stars import turned_by
 from benchmarks.swarm.plan import (
     ClockStep,
     Cloud,
@@ -186,7 +187,7 @@ class Instrument:
             random,
             self.invariants.motion.velocity,
             self.invariants.powered_unread,
-            self.invariants.encoders_read,
+            self.invariants.zeros.read,
         )
         self._add(f"{name} siderostat", amplifiers)
         bus = None
@@ -473,7 +474,7 @@ class Instrument:
                 line = self.lines[strike.device]
                 line.begin(fault, strike.lasts_s, strike.size, strike.part, strike.number)
                 if fault == "encoder":
-                    self.invariants.encoder_wrong(loop_name)
+                    self.invariants.zeros.encoder_wrong(loop_name)
                     self._forget_places(loop_name)
 
     def _cut_power(self, name: str) -> None:
@@ -491,7 +492,7 @@ class Instrument:
         if reach_arcsec > settings.siderostat.travel_sky_arcsec:
             self.amplifiers[name].reset()
             return
-        self.invariants.zero_lost(name)
+        self.invariants.zeros.lost(name)
         self.amplifiers[name].lose_power()
         self._forget_places(name)
 

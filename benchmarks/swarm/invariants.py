@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from benchmarks.swarm.devices.amplifiers import SwarmAmplifiers
 from benchmarks.swarm.devices.hexapod import SwarmHexapod
-from benchmarks.swarm.lines import Line
+from benchmarks.swarm.lines import WRONG_S, Line
 from benchmarks.swarm.motion import AT_REST, STUCK_S, WELL_S, Motion
+from benchmarks.swarm.own_stars import OwnStars, turned_by
+from benchmarks.swarm.zeros import Zeros
 from fitctl.clock import Clock
 from fitctl.config import Rig
 from fitctl.controllers.pair import LEARNT
-from fitctl.drivers.interface import AzEl
 from fitctl.logging.records import (
     AnyRecord,
     ControllerChange,
@@ -45,7 +46,7 @@ from fitctl.messages.commands import (
     Standby,
     Stop,
 )
-from fitctl.messages.modes import FOLLOWING, OPERATOR, Mode, Trigger
+from fitctl.messages.modes import OPERATOR, Mode, Trigger
 from fitctl.model.drives import experiment_s
 from fitctl.model.plant import Plant
 from fitctl.service.admission import Sender
@@ -56,7 +57,6 @@ Floats = NDArray[np.float64]
 NO_EXCEPTION = "no exception escapes"
 ANSWERED_ONCE = "a command is answered once"
 POWER_S = 1.0  # a loop may have power without need, or need without power, no longer than this
-_FOLLOWING = frozenset(mode.name for mode in FOLLOWING)
 _CAUSE_S = 10.0  # before a fault, in which its cause must have been
 _LEADS_TO = {
     Off: frozenset({Mode.OFF}),
@@ -69,16 +69,10 @@ _OF_THIS_MACHINE = {"RecorderReport", "LearnerReport"}
 _OF_COMMANDERS = {"Stop", "TakeOver", "SequenceControl", "SequenceReport"}
 _MOST_STEP_S = 1.0  # and as much for each loop with a D/A, which is read after a pause
 _MOST_PERIODS = 2.0  # a frame on which a tick acts is no older than that and its delay
-_LEFT_S = 2.0  # a supervisor leaves where its stars are once a second
-_JUMP_RAD = 1.0  # what motors may coast unseen, and somewhat more
 _MOST_BUSY_S = 60.0
 _MOST_VIOLATIONS = 20
 _MOST_ALIKE = 3
 _MOST_UNREAD_S = 14.0  # interlock piezo_limit does not wait longer
-_CHECKED_S = 0.5  # so often the swarm checks which star a loop follows
-_ANOTHERS_PX = 6.0  # from its own star, no window of a loop shows its own
-_MOST_WRONG_S = 10.0
-_RETURNS_PX = 40.0  # the star of a loop that goes on is nearer to the middle of the frame
 # As `made_safe` in the fault catalogue, tests/faults/devices.py.
 _SAFE_S, _SAFE_BY_PIEZO_S = 3.0, 8.0
 _RESTS_S = 1.0  # beyond the time after which a drive without its master stops by itself
@@ -86,12 +80,6 @@ _SURELY = 1.2  # times the following error limit: a servo that is behind so far 
 _COLLECTOR_RESTS_S = 3.0
 _SEQUENCE_ENDS_S = 15.0
 _EXPERIMENT_ENDS_S = 1.0  # after its last motion
-
-
-def turned_by(rig: Rig, name: str) -> list[str]:
-    """The loops whose siderostats turn the light of a loop: its own, and that of its link."""
-    loop = rig.stellar_loops.get(name)
-    return [name] if loop is None or loop.link is None else [name, loop.link]
 
 
 class Violation(NamedTuple):
@@ -159,10 +147,11 @@ class Invariants:
         self._clock = clock
         self._amplifiers = amplifiers
         self._lines = lines
-        self._plant = plant
         self._supervisor: Supervisor | None = None
+        self.zeros = Zeros(clock, lines, self.violated)
+        self.own_stars = OwnStars(rig, clock, lines, plant, self.violated)
         self.motion = Motion(
-            rig, clock, amplifiers, lines, plant, self.violated, self._zero_is_lost
+            rig, clock, amplifiers, lines, plant, self.violated, self.zeros.is_lost
         )
         self._stellar_loops = rig.stellar_loops
         self._needed = {name: list(self._needed_devices(name)) for name in rig.loops}
@@ -197,15 +186,7 @@ class Invariants:
         self._lease = "", -math.inf
         self._admitted: list[tuple[AnyCommand, str]] = []  # and not yet passed on
         self._opened: set[str] = set()
-        self._zeros_lost_rad: dict[str, float] = {}  # by loop: nobody has read the encoders since
-        self._zeros_read_rad: dict[str, float] = {}  # by loop: read, in an opening that goes on
-        self._zeros_noticed_s: dict[str, float] = {}
         self._struck_s: dict[str, float] = {}  # by device
-        self._misread: set[str] = set()  # loops whose encoders may have been read wrongly
-        self._checked_s: dict[str, float] = {}  # by loop: when the swarm last checked its star
-        self._wrong_since_s: dict[str, float] = {}  # by loop: since when it follows another star
-        self._pointed_at: set[str] = set()  # a person said which star these loops follow
-        self._waits_since_s: dict[str, float] = {}  # by loop that followed its star before
 
     def _needed_devices(self, name: str) -> Iterator[tuple[str, float]]:
         """The devices whose silence makes a loop go to SAFE in any other mode but OFF, and within what time.
@@ -224,13 +205,9 @@ class Invariants:
 
     def watch(self, supervisor: Supervisor | None) -> None:
         """Watch this one from now on; without one, what needs none."""
-        self._zeros_lost_rad = self._zeros_read_rad | self._zeros_lost_rad
-        self._zeros_read_rad.clear()
-        for name, noticed_s in self._zeros_noticed_s.items():
-            # A killed supervisor may have left the star's place from before it noticed.
-            if self._clock.now_s() - noticed_s < _LEFT_S:
-                self._zeros_lost_rad.setdefault(name, 0.0)
         self._supervisor = supervisor
+        self.zeros.watch(supervisor)
+        self.own_stars.watch(supervisor)
         self.motion.watch(supervisor)
         self._lease = "", -math.inf
         self._admitted.clear()
@@ -240,9 +217,6 @@ class Invariants:
         self._texts.clear()
         self._piezo_read_s = dict.fromkeys(self._rig.loops, math.inf)
         self._ticks.clear()
-        self._wrong_since_s.clear()
-        self._pointed_at.clear()
-        self._waits_since_s.clear()
         for lasting in self._lasting:
             lasting.clear()
         self._collector_is_stopped = False
@@ -265,26 +239,6 @@ class Invariants:
             self.motion.stopped_s[name] = max(self.motion.stopped_s[name], self._stepped_s)
         for lasting in self._lasting:
             lasting.leave_out(added_s)
-
-    def zero_lost(self, name: str) -> None:
-        """A loop's encoders begin anew at zero."""
-        position_rad = 0.0
-        if self._supervisor is not None:
-            position_rad = float(np.abs(self._supervisor.loops[name].servo.position_rad).max())
-        self._zeros_lost_rad[name] = max(position_rad, self._zeros_lost_rad.get(name, 0.0))
-
-    def _zero_is_lost(self, name: str) -> bool:
-        return name in self._zeros_lost_rad or name in self._zeros_read_rad
-
-    def encoder_wrong(self, name: str) -> None:
-        """An encoder of a loop reads wrong angles from now on."""
-        self._misread.add(name)
-
-    def encoders_read(self, name: str) -> None:
-        """A loop's encoders are read for the first time since its amplifiers were opened."""
-        lost_rad = self._zeros_lost_rad.pop(name, None)
-        if lost_rad is not None:
-            self._zeros_read_rad[name] = max(lost_rad, self._zeros_read_rad.get(name, 0.0))
 
     # ------------------------------------------------------------ commands and records
 
@@ -361,7 +315,7 @@ class Invariants:
             elif isinstance(command, Standby | Recover):
                 self._power_up_s[name] = now_s
             elif isinstance(command, Look):
-                self._pointed_at.add(name)
+                self.own_stars.pointed_at(name)
             elif isinstance(command, Experiment):
                 self._experiment_s[name] = experiment_s(command.drives)
 
@@ -380,7 +334,7 @@ class Invariants:
                 self._ticks[record.loop] += 1
                 if number >= 0:
                     self._acted_on(record)
-                    self._follows(record)
+                    self.own_stars.follows(record)
             case MetrologyTick():
                 self._ticks[record.loop] += 1
             case ModeChange():
@@ -395,7 +349,7 @@ class Invariants:
                 self._without_mistake(record.error)
                 self._texts.clear()
                 if not record.error:
-                    self._opened_well(record)
+                    self.zeros.opened(record, again=record.loop in self._opened)
                     self._opened.add(record.loop)
             case ControllerChange():
                 self._controller_changed(record)
@@ -422,30 +376,6 @@ class Invariants:
                 f"{loop.name}: in {loop.mode.name}, learn = {loop.learning.setting!r}",
             )
 
-    def _opened_well(self, opened: DevicesOpened) -> None:
-        name = opened.loop
-        # Encoders that lost their zero after this opening had read them are noticed by the next.
-        lost_rad = self._zeros_read_rad.pop(name, None)
-        if lost_rad is not None:
-            self._zeros_noticed_s[name] = self._clock.now_s()
-        # This opening's reading, or the last before it, may have been wrong.
-        if name in self._misread:
-            if not self._lines[f"{name} siderostat"].was_wrong("encoder", _MOST_WRONG_S):
-                self._misread.discard(name)
-            return
-        if opened.encoders_jumped and lost_rad is None and not self._reads_zero(name):
-            self.violated("encoders that count on keep the star's place", name)
-        is_far = lost_rad is not None and lost_rad > _JUMP_RAD and name in self._opened
-        if is_far and not opened.encoders_jumped:
-            self.violated("encoders that count from elsewhere are noticed", name)
-
-    def _reads_zero(self, name: str) -> bool:
-        """Encoders near zero: motors that passed there look the same as a loss of power."""
-        supervisor = self._supervisor
-        return supervisor is not None and bool(
-            np.abs(supervisor.loops[name].servo.position_rad).max() < _JUMP_RAD / 2
-        )
-
     def _acted_on(self, tick: Tick) -> None:
         oldest_s = self._oldest_s
         if tick.frame_age_s > oldest_s and self._camera_well():
@@ -453,68 +383,6 @@ class Invariants:
                 "a tick acts on the newest frame",
                 f"{tick.loop}: one of {tick.frame_age_s:.3f} s, at most {oldest_s:.3f} s",
             )
-
-    def _follows(self, tick: Tick) -> None:
-        """Whether the star that a loop follows is its own, unless a person pointed at it."""
-        name, now_s = tick.loop, tick.mid_exposure_s
-        if not now_s - self._checked_s.get(name, -math.inf) >= _CHECKED_S:
-            return
-        self._checked_s[name] = now_s
-        own_az_px, own_el_px = self._own_star_px(name, now_s)
-        away_px = math.hypot(tick.star_az_px - own_az_px, tick.star_el_px - own_el_px)
-        follows = tick.mode in _FOLLOWING and name not in self._pointed_at
-        # The star of an image that is repeated is where the own one was, and is followed there.
-        follows = follows and not self._lines["camera"].was_wrong("frozen", _MOST_WRONG_S)
-        if not (follows and away_px >= _ANOTHERS_PX):  # nor without a star
-            self._wrong_since_s.pop(name, None)
-            return
-        since_s = self._wrong_since_s.setdefault(name, now_s)
-        if now_s - since_s > _MOST_WRONG_S:
-            self.violated(
-                "a loop follows its own star",
-                f"{name}: in {tick.mode} at az {tick.star_az_px:.1f}, el {tick.star_el_px:.1f} px for "
-                f"{now_s - since_s:.1f} s; its own is at az {own_az_px:.1f}, el {own_el_px:.1f} px",
-            )
-
-    def _begins_to_wait(self, name: str) -> None:
-        self._waits_since_s.pop(name, None)
-        if name not in self._pointed_at and self._off_frame_px(name) <= _RETURNS_PX:
-            self._waits_since_s[name] = self._clock.now_s()
-
-    def _goes_on(self, name: str) -> None:
-        """Whether a loop that waited has its siderostat back at its star, if it can be there."""
-        since_s = self._waits_since_s.pop(name, None)
-        away_px = self._off_frame_px(name)
-        lost = _RETURNS_PX < away_px < math.inf
-        if since_s is None or not lost or self._supervisor is None:
-            return
-        loop = self._supervisor.stellar_loops[name]
-        waited_s = self._clock.now_s() - since_s
-        misled = any(
-            self._lines[f"{one} siderostat"].was_wrong("encoder", waited_s + _MOST_WRONG_S)
-            for one in turned_by(self._rig, name)
-        )
-        at_its_end = np.abs(loop.siderostat.setpoint_rad).max() >= loop.siderostat.travel_rad
-        is_expected = loop.star_finder.estimator.origin_px is not None
-        if is_expected and not (misled or at_its_end or loop.interlocks.holds):
-            self.violated(
-                "a loop that waited goes on at its star",
-                f"{name}: {away_px:.0f} px from it after {waited_s:.1f} s",
-            )
-
-    def _off_frame_px(self, name: str) -> float:
-        """From the middle of the frame to the own star of a loop; infinite if the loop follows none."""
-        if self._supervisor is None or self._supervisor.loops[name].mode not in FOLLOWING:
-            return math.inf
-        camera = self._rig.camera
-        az_px, el_px = self._own_star_px(name, self._clock.now_s())
-        return math.hypot(az_px - camera.width_px / 2, el_px - camera.height_px / 2)
-
-    def _own_star_px(self, name: str, time_s: float) -> AzEl:
-        """Where the star of a loop truly is on the camera."""
-        part = self._plant.stellar_loops[name]
-        az_px, el_px = part.spots_at_px(self._plant.row(time_s))[0, 0].tolist()
-        return az_px, el_px
 
     def _camera_well(self) -> bool:
         """Nothing has been wrong with the camera's line for a while, and it loses no frames.
@@ -531,7 +399,7 @@ class Invariants:
     def _mode_changed(self, change: ModeChange) -> None:
         name = change.loop
         if change.target == Mode.ACQUISITION.name:
-            self._pointed_at.discard(name)
+            self.own_stars.searched(name)
         if change.target == Mode.SAFE.name and change.source != Mode.SAFE.name:
             self._collector_is_to_stop(is_so=True)
         if change.target == Mode.STANDBY.name and change.source in {"OFF", "SAFE"}:
@@ -570,15 +438,15 @@ class Invariants:
     def _was_stuck(self, name: str) -> bool:
         """Its motors do not move or an encoder is wrong, or that was so recently, or before a recent stall."""
         stalled = self._clock.now_s() - self.motion.stall_ended_s < STUCK_S
-        within_s = _MOST_WRONG_S if stalled else STUCK_S
+        within_s = WRONG_S if stalled else STUCK_S
         line = self._lines[f"{name} siderostat"]
         return any(line.was_wrong(fault, within_s) for fault in ("stuck", "encoder"))
 
     def _reported(self, event: Event) -> None:
         if event.message.startswith("waits for "):
-            self._begins_to_wait(event.source)
+            self.own_stars.begins_to_wait(event.source)
         elif event.message.startswith("no longer waits for "):
-            self._goes_on(event.source)
+            self.own_stars.goes_on(event.source)
         if event.severity == "error" and event.source in self._rig.loops:
             if "->" not in event.message:
                 self._texts[event.message] += 1

@@ -19,6 +19,7 @@ from fitctl.drivers.interface import (
 
 Result = TypeVar("Result")
 
+WRONG_S = 10.0  # after wrong values, loops may still be misled by them
 _SLICE_S = 0.0005
 _SELDOM = 0.2  # a device is heard soon enough that fails in no larger part of the calls
 

@@ -193,14 +193,15 @@ def _find_nothing(self: MirrorStage) -> None:
 
 def _recalls_without_link(self: StellarLoop, place: StarPlace) -> None:
     _RECALL(self, place)
-    self._link_counts = False
+    self.star_motion.link_counts = False
 
 
 def _counts_from_the_search(self: StellarLoop, motor_rad: Any) -> None:
     known = self.star_finder.estimator.origin_px is not None
-    if self.link is not None and known and not self._link_counts:
-        self.link.set_origin()
-        self._link_counts = True
+    motion = self.star_motion
+    if motion.link is not None and known and not motion.link_counts:
+        motion.link.set_origin()
+        motion.link_counts = True
     _START_SEARCH(self, motor_rad)
 
 

@@ -120,14 +120,13 @@ class Link:
         """From the motors of the link's siderostat to those of the own one, shape (2, 2)."""
         return self._matrix
 
-    def begin(self) -> None:
+    def begin(self, _now_s: float) -> None:
         """Nothing is to be undone of what was turned so far."""
         self.undone_rad = self._ahead_rad()
 
     def set_origin(self) -> None:
         """Count turns from here on."""
-        self.begin()
-        self.origin_rad = self.undone_rad
+        self.origin_rad = self.undone_rad = self._ahead_rad()
 
     def recall(self, motor_rad: AzEl) -> None:
         """Count turns from where a supervisor that was killed had the motors of the link's siderostat."""
@@ -139,10 +138,10 @@ class Link:
         """By how much the own set-point differs from one that knows nothing of the link."""
         return self.undone_rad - self.origin_rad
 
-    def step_rad(self) -> Floats:
+    def step_rad(self, now_s: float) -> Floats:
         """By how much the own set-point is to move now, so that the star stays where it is."""
         before_rad = self.undone_rad
-        self.begin()
+        self.begin(now_s)
         return before_rad - self.undone_rad
 
     def _ahead_rad(self) -> Floats:

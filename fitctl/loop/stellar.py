@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import AxisPair, Rig
 from fitctl.config import Loop as LoopSettings
+from fitctl.config import Rig
 from fitctl.controllers.centroid import OtherLight, Star, sensor_noise_px
 from fitctl.controllers.design.document import design_json
 from fitctl.controllers.pair import Design, Designer
@@ -33,7 +32,7 @@ from fitctl.loop.pointing import Pointing, error_from
 from fitctl.loop.quantities import StellarQuantities, stellar_places
 from fitctl.loop.search.finder import StarFinder
 from fitctl.loop.search.star import StarSearch
-from fitctl.loop.sky import Sky
+from fitctl.loop.star_motion import StarMotion
 from fitctl.loop.tick_record import TickRecords, TickTimes
 from fitctl.messages.commands import Acquire, LearnerReport
 from fitctl.messages.modes import FOLLOWING, TRACKING, Finding, Mode, Trigger
@@ -84,36 +83,27 @@ class StellarLoop(Loop):
         )
         self.settings: LoopSettings = rig.stellar_loops[name]
         self.quantities: StellarQuantities
-        self.link: Link | None = None
-        self.sky: Sky | None = None
         self.backlash: BacklashFeedforward | None = None
         self.others: list[StellarLoop] = []
         self.waits_for = ""
         self.mirror = mirror
         self.target_px = np.array([self.settings.target_px.az, self.settings.target_px.el])
         scale = scales(rig, self.settings)
+        self.star_motion = StarMotion(self.settings, scale, rig.camera.period_s)
         self.star_finder = StarFinder(rig, name, self.target_px, self._report_event)
         self.search = StarSearch(rig, name, self.star_finder)
         self.following = Following(self.settings, scale)
         self.pointing = Pointing(rig, name, self.target_px, design)
         self.learning = Learning(rig, name)
         self._limits = stellar_limits(rig, name)
-        if self.settings.star_rate_sky_arcsec_s is not None:
-            self.sky = Sky(scale, rig.camera.period_s)
-            self.sky.move_at(self.settings.star_rate_sky_arcsec_s)
         self._scale = scale
         self._period_s, self._delay_s = rig.camera.period_s, rig.camera.frame_delay_s
         self._experiments = Experiments(name, scale.motor_px_per_rad, journal)
         self._tick_records = TickRecords(rig, name)
         self._flattened = self._held = False
         self._search_due: bool | None = None  # whether it is for a star that was followed
-        self._link_counts = (
-            False  # what the link's siderostat turns moves the star that is expected
-        )
         self._rig_noise_px = sensor_noise_px(rig.camera, self.settings, self.settings.star_flux_dn)
         self._recalled: StarPlace | None = None  # until the devices are open
-        self._given_rate: AxisPair | None = None  # by the last acquire
-        self._recalled_rate: AxisPair | None = None  # by one before a kill, until the next
         self._held_undone_rad = np.zeros(2)  # of link and sky, as an experiment began
         self._laws: dict[Mode, Callable[[Observation], None]] = {
             Mode.OFF: self._rest,
@@ -142,14 +132,12 @@ class StellarLoop(Loop):
             motor_rad = self.servo.position_at(frame.mid_exposure_s)
             mirror_rad = self.mirror.at(frame.mid_exposure_s)
         time_s = begun_s if frame is None else frame.mid_exposure_s
-        link_rad = link_motor_rad = sky_rad = None
-        if self.link is not None:
-            self.link.read_at(time_s)
-            link_rad, link_motor_rad = self.link.turned_rad, self.link.motor_rad
-        if self.sky is not None:
-            self.sky.read_at(time_s)
-            self.search.sky_rad = sky_rad = self.sky.turned_rad
-            link_rad = sky_rad if link_rad is None else link_rad + sky_rad
+        self.star_motion.read_at(time_s)
+        link, sky, link_rad = (
+            self.star_motion.link,
+            self.star_motion.sky,
+            self.star_motion.turned_rad,
+        )
         if frame is not None:
             beam_rad = motor_rad if link_rad is None else motor_rad + link_rad
             star = self._find(frame, mirror_rad, motor_rad, beam_rad)
@@ -163,8 +151,8 @@ class StellarLoop(Loop):
             servo,
             begun_s,
             link_rad,
-            link_motor_rad,
-            sky_rad,
+            None if link is None else link.motor_rad,
+            None if sky is None else sky.turned_rad,
             None if self.backlash is None else self.backlash.at(time_s),
         )
         self._sensed_s = self._clock.now_s()
@@ -242,10 +230,13 @@ class StellarLoop(Loop):
     def _move(self, observation: Observation) -> None:
         """Follow the link and the mode's law, unless an interlock holds or flattens."""
         stopped = self._is_stopped
-        if self.link is not None and not stopped:
-            self._follow_link(self.link)
-        if self.sky is not None and not stopped:
-            self._follow_sky(self.sky, observation.now_s)
+        if not stopped:
+            self.star_motion.undo(
+                self.siderostat,
+                observation.now_s,
+                tracked=self.mode in TRACKING,
+                searched=self._search_due is None,
+            )
         flattens = stopped and self.interlocks.action == "flatten"
         if flattens:
             self.mirror.step_to_bias()
@@ -311,7 +302,7 @@ class StellarLoop(Loop):
         if not searches or attribution is None or attribution.candidate is None:
             return []
         motor_rad = self.servo.position_at(time_s)
-        beam_rad = sum((part.turned_at(time_s) for part in self._beside()), motor_rad)
+        beam_rad = self.star_motion.beam_at(time_s, motor_rad)
         stages_px = self.star_finder.estimator.stages_px(beam_rad, self.mirror.at(time_s))
         return self.star_finder.spots(attribution.moved_px(stages_px))
 
@@ -372,7 +363,7 @@ class StellarLoop(Loop):
         elif self.mode is Mode.VERNIER:
             if self.backlash is not None:
                 self.backlash.begin(np.zeros(2))
-            self._start_pair(self._beam_rad(motor_rad))
+            self._start_pair(self.star_motion.beam_rad(motor_rad))
 
     def _start_pair(self, beam_rad: Floats) -> None:
         """The pair goes on from where the mirror is, with all siderostats at `beam_rad`, shape (2,)."""
@@ -387,23 +378,8 @@ class StellarLoop(Loop):
         """As the design asks; but no measurement corrects what makes up for backlash, so that must be exact."""
         return self.backlash is not None or self.pointing.design.hysteresis_inverse
 
-    def _beam_rad(self, motor_rad: Floats) -> Floats:
-        """Motor angles that turn the star as far as all siderostats and the sky, as last read, shape (2,)."""
-        return sum((part.turned_rad for part in self._beside()), motor_rad)
-
-    def _beside(self) -> list[Link | Sky]:
-        """What turns the star beside the loop's own motors."""
-        return [part for part in (self.link, self.sky) if part is not None]
-
     def _read_link(self, now_s: float) -> AzEl:
-        if self.sky is not None:
-            self.sky.read_at(now_s)
-            self.search.sky_rad = self.sky.turned_rad
-        if self.link is None:
-            return super()._read_link(now_s)
-        self.link.read_now()
-        az_rad, el_rad = self.link.motor_rad.tolist()
-        return az_rad, el_rad
+        return self.star_motion.read_now(now_s)
 
     def configure_search(self, asked: Acquire) -> None:
         """What the next search is to find, and how, as a command asks that was not refused."""
@@ -421,37 +397,18 @@ class StellarLoop(Loop):
                 self.use(self.learning.before, why, by_itself=True)
         self.star_finder.expect_flux(flux_dn)
         self.quantities.star_flux_dn = flux_dn
-        self._expect_rate(asked)
+        self.star_motion.expect_rate(asked, self._clock.now_s())
         self.search.configure(asked)
-
-    def _expect_rate(self, asked: Acquire) -> None:
-        """From now on the star moves as a command says, or as the rig file does."""
-        az, el = asked.rate_az_sky_arcsec_s, asked.rate_el_sky_arcsec_s
-        self._given_rate, self._recalled_rate = self._recalled_rate, None
-        if az is not None and el is not None:
-            self._given_rate = AxisPair(az=az, el=el)
-        elif asked.expected_az_sky_arcsec is not None:
-            self._given_rate = None  # the star of a command before a kill was another one
-        rate = self._given_rate or self.settings.star_rate_sky_arcsec_s
-        if self.sky is None and rate is not None:
-            now_s = self._clock.now_s()
-            self.sky = Sky(self._scale, self._period_s, now_s)
-            self.sky.begin(now_s)
-        if self.sky is not None:
-            self.sky.move_at(rate)
 
     def _start_search(self, motor_rad: Floats) -> None:
         """As asked; else about where the star is expected: on the target, or where it was last seen."""
         again, self._search_due = bool(self._search_due), None
-        asked = self.search.asked_place_sky_arcsec is not None
-        if self.link is not None and (asked or not self._link_counts):
-            # What the link's siderostat turned before, to find its beam, moved no star that was known. A
-            # command that gives a place means it with the link as it is now.
-            self.link.set_origin()
+        if self.star_motion.count_link(anew=self.search.asked_place_sky_arcsec is not None):
             self.star_finder.estimator.forget()
-        self._link_counts = True
-        self.star_finder.estimator.expect(self.target_px, self._beam_rad(motor_rad), np.zeros(2))
-        self.search.start_where_expected(again=again)
+        self.star_finder.estimator.expect(
+            self.target_px, self.star_motion.beam_rad(motor_rad), np.zeros(2)
+        )
+        self.search.start_where_expected(self.star_motion.sky_rad, again=again)
 
     # ------------------------------------------------------------ the link, and other loops
 
@@ -462,11 +419,11 @@ class StellarLoop(Loop):
             if not isinstance(link, MetrologyLoop):
                 msg = f"loops.{self.name}.link: {link.name} is no metrology loop"
                 raise TypeError(msg)
-            self.link = Link(link, self.settings)
+            self.star_motion.link = Link(link, self.settings)
             given = self.settings.feedforward
             if given is not None and given.gain and given.signal == "encoders+backlash":
                 self.backlash = BacklashFeedforward(
-                    self.link, self.siderostat, self.settings, self._scale
+                    self.star_motion.link, self.siderostat, self.settings, self._scale
                 )
         self.others = [
             loop for loop in loops.values() if isinstance(loop, StellarLoop) and loop is not self
@@ -476,9 +433,10 @@ class StellarLoop(Loop):
         """What the loop waits for; empty if for nothing."""
         if self.mode not in TRACKING:
             return ""
-        if self.link is not None:
-            if not self.link.settled(now_s):
-                loop = self.link.loop
+        link = self.star_motion.link
+        if link is not None:
+            if not link.settled(now_s):
+                loop = link.loop
                 return f"the link of {loop.name}, which is in {loop.mode.name}"
             # After a link's return the siderostat may have far to go.
             setpoint_rad = self.siderostat.setpoint_rad
@@ -517,16 +475,14 @@ class StellarLoop(Loop):
 
     def _forget_with_link_zero(self) -> None:
         """The star is expected with the link as it was; if that counts from elsewhere now, nowhere."""
-        if self.link is not None and self.link.zero_was_lost():
-            if self.star_finder.estimator.origin_px is not None:
-                link = self.link.loop.name
-                self._report_event(
-                    "warning",
-                    f"encoders of {link} read elsewhere than before; the star's place is forgotten",
-                )
-            self._link_counts = False
-            self.link.set_origin()
-            self.star_finder.estimator.forget()
+        if not self.star_motion.link_zero_was_lost():
+            return
+        if self.star_finder.estimator.origin_px is not None:
+            self._report_event(
+                "warning",
+                f"encoders of {self.settings.link} read elsewhere than before; the star's place is forgotten",
+            )
+        self.star_finder.estimator.forget()
 
     def _go_on(self, observation: Observation) -> None:
         """The control laws begin anew from where the stages are."""
@@ -535,20 +491,6 @@ class StellarLoop(Loop):
             self.pointing.start_coarse(self.target_px)
         elif self.mode is Mode.VERNIER:
             self._start_pair(observation.beam_rad)
-
-    def _follow_link(self, link: Link) -> None:
-        """Undo what the link's siderostat turns, as soon as it holds."""
-        if self.mode not in TRACKING:
-            link.begin()
-        elif link.holds and self._search_due is None:
-            self.siderostat.undo(link.step_rad())
-
-    def _follow_sky(self, sky: Sky, now_s: float) -> None:
-        """Undo what the star moves by itself, as long as it is tracked and its light arrives."""
-        if self.mode not in TRACKING:
-            sky.begin(now_s)
-        elif (self.link is None or self.link.holds) and self._search_due is None:
-            self.siderostat.undo(sky.step_rad(now_s))
 
     # ------------------------------------------------------------ control laws
 
@@ -563,13 +505,9 @@ class StellarLoop(Loop):
     def _search(self, observation: Observation) -> None:
         self.mirror.step_to_rest()
         # If the search has begun in this tick, what the link turns counts from elsewhere than when it was read.
-        beam_rad = self._beam_rad(observation.motor_rad)
+        beam_rad = self.star_motion.beam_rad(observation.motor_rad)
         wanted_rad = self.search.advance_from(observation.motor_rad, beam_rad, self._period_s)
-        if self.link is not None:
-            wanted_rad = wanted_rad - self.link.undone_from_origin_rad
-        if self.sky is not None:
-            wanted_rad = wanted_rad - self.sky.undone_rad
-        self.siderostat.move_to(wanted_rad)
+        self.siderostat.move_to(self.star_motion.setpoint_rad(wanted_rad))
 
     def _pull_in(self, observation: Observation) -> None:
         self.mirror.step_to_rest()
@@ -604,11 +542,7 @@ class StellarLoop(Loop):
 
     def _undone_since_held(self) -> Floats:
         """How far link and sky have moved the siderostat since an experiment began, shape (2,)."""
-        return self._held_undone_rad - self._undone_rad()
-
-    def _undone_rad(self) -> Floats:
-        """What the siderostat undoes of link and sky, shape (2,), from a zero that is always the same."""
-        return sum((part.undone_rad for part in self._beside()), np.zeros(2))
+        return self._held_undone_rad - self.star_motion.undone_rad
 
     # ------------------------------------------------------------ designs and experiments
 
@@ -643,7 +577,7 @@ class StellarLoop(Loop):
         link_rad = self._read_link(now_s)
         self.pointing.use(design)
         if self.mode is Mode.VERNIER and not self.pointing.start_knowing():
-            self._start_pair(self._beam_rad(motor_rad))
+            self._start_pair(self.star_motion.beam_rad(motor_rad))
         az_rad, el_rad = motor_rad.tolist()
         link_az_rad, link_el_rad = link_rad
         self._journal.record(
@@ -668,7 +602,7 @@ class StellarLoop(Loop):
         now_s = self._clock.now_s()
         if not self.fire(Trigger.EXPERIMENT, name):
             return False
-        self._held_undone_rad = self._undone_rad()
+        self._held_undone_rad = self.star_motion.undone_rad
         self._experiments.begin(name, drives, self.siderostat, self.mirror, now_s)
         return True
 
@@ -687,9 +621,9 @@ class StellarLoop(Loop):
     def state(self, now_s: float) -> LoopState:
         """The newest of everything, for consoles."""
         scale, mode, design = self._scale, self.mode, self.pointing.design
-        centre_rad = self.search.centre_rad - self.search.sky_rad
-        if self.link is not None:
-            centre_rad = centre_rad - self.link.undone_from_origin_rad
+        centre_rad, link = self.search.centre_rad - self.star_motion.sky_rad, self.star_motion.link
+        if link is not None:
+            centre_rad = centre_rad - link.undone_from_origin_rad
         centre_sky_arcsec = (centre_rad * scale.motor_sky_arcsec_per_rad).tolist()
         az_urad, el_urad = (1e6 * self.mirror.bias_offset_rad).tolist()
         return LoopState(
@@ -733,8 +667,7 @@ class StellarLoop(Loop):
         jumped, self.servo.encoders_jumped = self.servo.encoders_jumped, False
         recalled, self._recalled = self._recalled, None
         if jumped:
-            self._link_counts = False
-            self._recalled_rate = None
+            self.star_motion.forget()
             self.star_finder.estimator.forget()
             self._report_event(
                 "warning", "encoders read elsewhere than before; the star's place is forgotten"
@@ -749,7 +682,7 @@ class StellarLoop(Loop):
         self._forget_with_link_zero()
         if recalled is not None and self.star_finder.estimator.origin_px is not None:
             now_s = self._clock.now_s()
-            moved = self._moved_by(now_s)
+            moved = self.star_motion.moved_by(now_s)
             self._journal.record(msgspec.structs.replace(recalled, time_s=now_s, **moved))
             self._report_event(
                 "info",
@@ -761,14 +694,15 @@ class StellarLoop(Loop):
         """Where its star is; None where nothing is known of it."""
         estimator = self.star_finder.estimator
         # Encoders that have jumped since the star was found have another zero than its place.
-        jumped = self.servo.encoders_jumped or (self.link is not None and self.link.zero_is_lost)
+        link = self.star_motion.link
+        jumped = self.servo.encoders_jumped or (link is not None and link.zero_is_lost)
         if estimator.origin_px is None or jumped:
             return None
         az_rad, el_rad = self.servo.position_rad.tolist()
         link_motor_rad = link_rad = np.zeros(2)
-        if self.link is not None:
-            link_motor_rad = self.link.servo.position_rad
-            link_rad = self.link.turned_with(link_motor_rad)
+        if link is not None:
+            link_motor_rad = link.servo.position_rad
+            link_rad = link.turned_with(link_motor_rad)
         link_az_px, link_el_px = estimator.stages_px(link_rad, np.zeros(2))
         link_az_rad, link_el_rad = link_motor_rad.tolist()
         now_s = self._clock.now_s()
@@ -781,45 +715,15 @@ class StellarLoop(Loop):
             siderostat_el_rad=el_rad,
             link_az_rad=link_az_rad,
             link_el_rad=link_el_rad,
-            **self._moved_by(now_s),
+            **self.star_motion.moved_by(now_s),
         )
-
-    def _moved_by(self, time_s: float) -> dict[str, Any]:
-        """How far its star has moved by itself by a time, and how fast it does: fields of a `StarPlace`."""
-        moved_rad = np.zeros(2) if self.sky is None else self.sky.turned_at(time_s)
-        moved_az_rad, moved_el_rad = moved_rad.tolist()
-        rate = self._given_rate or AxisPair(az=0.0, el=0.0)
-        return {
-            "moved_az_rad": moved_az_rad,
-            "moved_el_rad": moved_el_rad,
-            "rate_is_given": self._given_rate is not None,
-            "rate_az_sky_arcsec_s": rate.az,
-            "rate_el_sky_arcsec_s": rate.el,
-        }
 
     def recall(self, place: StarPlace) -> None:
         """Expect the star where a supervisor that was killed had it."""
         self._recalled = place
         self.servo.recall((place.siderostat_az_rad, place.siderostat_el_rad))
-        if self.link is not None:
-            self.link.recall((place.link_az_rad, place.link_el_rad))
-        self._recall_sky(place)
+        self.star_motion.recall(place)
         self.star_finder.estimator.observe((place.az_px, place.el_px), (0.0, 0.0))
-        self._link_counts = True
-
-    def _recall_sky(self, place: StarPlace) -> None:
-        """Expect the star to go on from where it had moved to by itself, if that is known."""
-        if place.rate_is_given:
-            given = AxisPair(az=place.rate_az_sky_arcsec_s, el=place.rate_el_sky_arcsec_s)
-            self._given_rate = self._recalled_rate = given
-        moved_rad = np.array([place.moved_az_rad, place.moved_el_rad])
-        rate = self._given_rate or self.settings.star_rate_sky_arcsec_s
-        if np.isnan(moved_rad).any():
-            return
-        if self.sky is None and (rate is not None or moved_rad.any()):
-            self.sky = Sky(self._scale, self._period_s, place.time_s)
-        if self.sky is not None:
-            self.sky.recall(place.time_s, moved_rad, rate)
 
     def release(self) -> None:
         """Send the D/A nothing more."""

@@ -118,8 +118,8 @@ class Replay:
             self._make_loop,
         )
         for name, loop in self._supervisor.stellar_loops.items():
-            if loop.link is not None:
-                loop.link.servo = LoggedLink(self._servos[name])
+            if loop.star_motion.link is not None:
+                loop.star_motion.link.servo = LoggedLink(self._servos[name])
         self._step = LoggedStep()
         self._waiting: set[str] = set()
         self._overlap: Overlap | None = None

@@ -1,4 +1,4 @@
-"""What the swarm requires of devices that are silent, and of stages that are to stand still."""
+"""What the swarm requires of devices that are silent, of commands, and of what is recorded."""
 
 from random import Random
 from types import SimpleNamespace
@@ -8,105 +8,41 @@ import pytest
 from samples.learner_reports import report
 
 from benchmarks.swarm.commands import LEARNT_DESIGNS
-from benchmarks.swarm.devices.hexapod import SwarmHexapod
-from benchmarks.swarm.instrument import RIGS as FOLDER
-from benchmarks.swarm.invariants import NO_EXCEPTION, Invariants
-from benchmarks.swarm.lines import FAULTS, WRONG, Line
+from benchmarks.swarm.invariants import NO_EXCEPTION
+from benchmarks.swarm.lines import FAULTS, WRONG
 from benchmarks.swarm.past import put_back
 from benchmarks.swarm.plan import Order, Plan, Strike
-from benchmarks.swarm.rigs import devices_of
 from benchmarks.swarm.run import run_plan
-from benchmarks.swarm.threads import VirtualTime
-from fitctl.config import load_rig
-from fitctl.drivers.interface import Pose
-from fitctl.logging.records import ModeChange
+from benchmarks.swarm.service import SENDERS
+from fitctl.logging.records import ModeChange, RecorderStatus
 from fitctl.loop.learning import Learning
 from fitctl.loop.stellar import StellarLoop
 from fitctl.messages.commands import (
     Experiment,
-    Jog,
     MoveCollector,
     Off,
+    RecorderReport,
     Release,
     Reply,
     SequenceControl,
     Standby,
+    Status,
     Stop,
+    TakeOver,
 )
 from fitctl.messages.modes import Mode
 from fitctl.model.drives import standstill
-from fitctl.model.plant import Plant
+from fitctl.service.admission import Admission
 from fitctl.stages.collector import CollectorDrive
 from fitctl.stages.journal import error_text
 from fitctl.stages.servo import SiderostatServo
 from fitctl.supervisor.piezo import PiezoWatch
-
-TESTBED = "fit-testbed.toml"
-TICK_S = 0.1
-
-
-def named(device):
-    """As a device's errors name it."""
-    kind = device.rpartition(" ")[2]
-    return "piezo amplifier" if kind == "piezo" else kind
-
-
-class Rig:
-    """Invariants over stand-ins of a supervisor, of amplifiers and of lines that are all connected."""
-
-    def __init__(self, rig="fit-mock.toml", mode=Mode.VERNIER):
-        self.rig = load_rig(FOLDER / rig)
-        self.time = VirtualTime()
-        self.lines = {
-            name: Line(named(name), "", self.time, Random(1), 0.001, 0.1)
-            for name in devices_of(rig)
-        }
-        for line in self.lines.values():
-            line.connected = True
-        self.amplifiers = {
-            name: SimpleNamespace(
-                zero_rad=(0.0, 0.0),
-                powered=mode not in {Mode.OFF, Mode.SAFE},
-                watches_nobody=False,
-                fault="",
-                velocity_rad_s=(0.0, 0.0),
-                master_timeout_s=0.5,
-                line=self.lines[f"{name} siderostat"],
-            )
-            for name in self.rig.loops
-        }
-        self.plant = Plant(self.rig, [1], history_s=20.0)
-        self.jobs = SimpleNamespace(busy=False)
-        self.servo = SimpleNamespace(_wanted_rad=(0.0, 0.0), position_rad=(0.0, 0.0))
-        self.loops = {
-            name: SimpleNamespace(
-                mode=mode,
-                mode_since_s=0.0,
-                servo=self.servo,
-                mirror=SimpleNamespace(command_rad=np.zeros(2)),
-            )
-            for name in self.rig.loops
-        }
-        self.invariants = Invariants(self.rig, self.time, self.amplifiers, self.lines, self.plant)
-        self.supervisor = SimpleNamespace(
-            loops=self.loops,
-            stellar_loops=self.loops,
-            _device_jobs=self.jobs,
-            piezos={},
-            sequences=SimpleNamespace(),
-        )
-        self.invariants.watch(self.supervisor)
-
-    def go_on(self, seconds):
-        """Tick for a while; return what was violated until now."""
-        for _ in range(round(seconds / TICK_S)):
-            self.time.run_until(self.time.now_s() + TICK_S)
-            self.invariants._ticks.update(list(self.loops))  # each has recorded one
-            self.invariants.tick()
-        return [one.invariant for one in self.invariants.violations]
-
+from tests.benchmarks.watched import TESTBED, Rig
+from tests.samples.log_samples import tick
 
 SAFE = ["a loop without one of its devices is SAFE in time"]
+
+
 SILENT = [
     ("fit-mock.toml", "right siderostat", 3.0),
     ("fit-mock.toml", "right D/A", 3.0),
@@ -212,133 +148,6 @@ def test_a_slow_line_is_not_silent():
     assert watched.go_on(10.0) == []
 
 
-# ------------------------------------------------------------ travel
-
-
-@pytest.mark.parametrize(
-    ("motor_rad", "zero_rad", "velocity_rad_s", "violated"),
-    [
-        (90.0, 0.0, 5.0, ["no siderostat is driven beyond its travel"]),
-        (-90.0, 0.0, -5.0, ["no siderostat is driven beyond its travel"]),
-        (90.0, 0.0, -5.0, []),  # on its way back
-        (90.0, 0.0, 0.5, []),  # where it is held
-        (70.0, 0.0, 5.0, []),
-        (90.0, 40.0, 5.0, []),  # by the drive's count, within it
-        (70.0, -40.0, 5.0, ["no siderostat is driven beyond its travel"]),
-    ],
-)
-def test_no_motor_that_is_beyond_its_travel_is_driven_farther(
-    motor_rad, zero_rad, velocity_rad_s, violated
-):
-    watched = Rig()
-    watched.plant.loops["right"].state.motor_rad[0] = 0.0, motor_rad
-    watched.amplifiers["right"].zero_rad = 0.0, zero_rad
-    for rad_s in np.linspace(0.0, velocity_rad_s, 11):  # as fast as it may accelerate
-        watched.invariants.motion.velocity("right", (0.0, rad_s))
-
-    assert watched.go_on(0.1) == violated
-
-
-def test_a_motor_beyond_its_travel_may_return_to_where_it_was_sent_back_from_and_no_farther():
-    watched = Rig()
-    motor_rad = watched.plant.loops["right"].state.motor_rad[0]
-    send = watched.invariants.motion.velocity
-    motor_rad[:] = 0.0, 82.0
-    for rad_s in np.linspace(0.0, -5.0, 11):
-        send("right", (0.0, rad_s))
-    motor_rad[:] = 0.0, 81.0
-    for rad_s in np.linspace(-5.0, 5.0, 21):  # a release: it is held where it was
-        send("right", (0.0, rad_s))
-    assert watched.go_on(0.1) == []
-
-    motor_rad[:] = 0.0, 82.5
-    send("right", (0.0, 5.0))
-    assert watched.go_on(0.1) == ["no siderostat is driven beyond its travel"]
-
-
-def test_a_velocity_changes_no_faster_than_a_motor_may_accelerate_but_for_a_stop():
-    watched = Rig()
-    siderostat = watched.rig.loops["right"].siderostat
-    step_rad_s = siderostat.acceleration_limit_rad_s2 / siderostat.servo.rate_hz
-    send = watched.invariants.motion.velocity
-    for number in range(5):
-        send("right", (number * step_rad_s, 0.0))
-    send("right", (0.0, 0.0))
-    assert watched.go_on(0.1) == []
-
-    send("right", (0.0, 1.1 * step_rad_s))
-    assert watched.go_on(0.1) == ["acceleration within its limit"]
-
-
-# ------------------------------------------------------------ rest
-
-
-def test_motors_that_turn_though_none_is_sent_a_velocity_are_noticed():
-    watched = Rig(mode=Mode.SAFE)
-    watched.amplifiers["right"].velocity_rad_s = 1.0, 0.0
-
-    assert watched.go_on(1.5) == []
-    assert watched.go_on(0.3) == ["motors stand still in OFF and SAFE"]
-
-
-def test_a_drive_that_watches_nobody_turns_on_while_it_cannot_be_reached():
-    watched = Rig(mode=Mode.SAFE)
-    amplifiers = watched.amplifiers["right"]
-    amplifiers.watches_nobody, amplifiers.velocity_rad_s = True, (1.0, 0.0)
-    amplifiers.line.faults["deaf"] = 0.0
-
-    assert watched.go_on(10.0) == []
-
-
-MOVES = ["a siderostat that nobody moves stands still in STANDBY"]
-
-
-def turn(watched, turned_rad=0.01):
-    """Turn a motor that stood still."""
-    watched.go_on(0.1)
-    watched.plant.loops["right"].state.motor_rad[0, 0] += turned_rad
-
-
-def test_a_siderostat_moves_in_standby_only_after_a_jog():
-    watched = Rig(mode=Mode.STANDBY)
-    watched.go_on(10.0)
-    jog = Jog(az_sky_arcsec=10.0, el_sky_arcsec=0.0)
-    watched.invariants.posted(jog, "ada")
-    turn(watched)
-    watched.go_on(1.0)
-    watched.invariants.answered(jog, Reply(accepted=True))
-    watched.go_on(2.0)
-    turn(watched)
-    assert watched.go_on(5.0) == []
-
-    turn(watched, turned_rad=1e-4)  # no more than its encoder counts
-    assert watched.go_on(0.1) == []
-    turn(watched)
-    assert watched.go_on(0.1) == MOVES
-
-
-def test_in_standby_a_servo_may_go_back_to_where_it_was_after_a_fault():
-    watched = Rig(mode=Mode.STANDBY)
-    line = watched.lines["right siderostat"]
-    watched.go_on(10.0)
-    line.faults["slow"] = 10.0
-    turn(watched)
-    watched.go_on(0.1)
-    line.heal()
-    turn(watched)
-
-    assert watched.go_on(0.1) == []
-
-
-def test_motors_that_are_stuck_are_commanded_in_standby():
-    watched = Rig(mode=Mode.STANDBY)
-    watched.go_on(10.0)
-    watched.lines["right siderostat"].wrong["stuck"] = 0.0
-    turn(watched)
-
-    assert watched.go_on(0.1) == []
-
-
 @pytest.mark.parametrize(
     ("wrong", "violated"), [("trip", ["an axis that is not stuck is not called so"]), ("stuck", [])]
 )
@@ -362,28 +171,6 @@ def test_an_axis_may_be_called_stuck_only_if_it_is(wrong, violated):
     watched.invariants.record(change)
 
     assert watched.go_on(0.1) == ["an axis that is not stuck is not called so"]
-
-
-# ------------------------------------------------------------ the collector
-
-
-@pytest.mark.parametrize(
-    ("pose", "velocity_mm_s", "violated"),
-    [
-        (Pose(), 1.0, []),
-        (Pose(x_mm=1000.0), 1.0, ["the hexapod's poses within its travel"]),
-        (Pose(), 1000.0, ["the hexapod's velocity within its limit"]),
-    ],
-)
-def test_the_hexapod_is_sent_nothing_beyond_its_limits(pose, velocity_mm_s, violated):
-    watched = Rig(TESTBED)
-    hexapod = SwarmHexapod(
-        watched.plant, watched.time, watched.rig, Random(1), watched.invariants.motion.pose
-    )
-    hexapod.line.connected = True
-    watched.time.spawn(lambda: hexapod.move_to(pose, velocity_mm_s), "moves")
-
-    assert watched.go_on(0.1) == violated
 
 
 @pytest.mark.parametrize("stop", [Stop(loop="left"), MoveCollector(action="stop")])
@@ -494,9 +281,6 @@ def test_a_stop_stops_a_collector_whose_start_waits_for_the_same_step():
     assert run(*happenings, rig=TESTBED, duration_s=18.0) == set()
 
 
-# ------------------------------------------------------------ what is stuck, and what rests
-
-
 STUCK = ["a loop whose motors are stuck is SAFE in time"]
 
 
@@ -523,50 +307,6 @@ def test_motors_that_do_not_move_and_need_not_are_no_violation(wrong, mode, want
     watched.servo._wanted_rad = (0.0, wanted_rad)
 
     assert watched.go_on(8.0) == []
-
-
-def swings(watched, seconds):
-    """Write two voltages in turn, each within the slew."""
-    low_v, high_v = np.full(3, 5.0), np.full(3, 5.2)
-    for _ in range(round(seconds / TICK_S)):
-        watched.go_on(TICK_S)
-        watched.invariants.motion.volts("right", high_v, low_v)
-        low_v, high_v = high_v, low_v
-    return [one.invariant for one in watched.invariants.violations]
-
-
-@pytest.mark.parametrize("mode", [Mode.OFF, Mode.SAFE, Mode.STANDBY])
-def test_a_mirror_that_swings_at_rest_is_noticed(mode):
-    watched = Rig(mode=mode)
-
-    assert swings(watched, 1.0) == []
-    assert swings(watched, 0.5) == ["a mirror at rest stays where it is"]
-
-
-@pytest.mark.parametrize("since_s", [0.0005, 0.02])
-@pytest.mark.parametrize("mode", [Mode.SAFE, Mode.STANDBY, Mode.VERNIER])
-def test_the_first_write_at_rest_is_within_the_slew_if_it_was_decided_there(since_s, mode):
-    watched = Rig(mode=mode)
-    watched.go_on(5.0)
-    watched.loops["right"].mode_since_s = watched.time.now_s() - since_s
-    watched.invariants.motion.volts("right", np.full(3, 7.0), np.full(3, 5.0))
-
-    jumps = since_s > 0.001 and mode is not Mode.VERNIER
-    assert watched.go_on(0.1) == ["the mirror rests no faster than its slew"] * jumps
-
-
-@pytest.mark.parametrize(
-    ("part", "violated"), [(0.99, []), (1.01, ["the mirror stays within its range"])]
-)
-@pytest.mark.parametrize("direction", [(1.0, 0.0), (0.5, -0.5)])
-def test_a_mirror_that_points_stays_within_its_diamond(part, violated, direction):
-    watched = Rig(mode=Mode.VERNIER)
-    watched.go_on(5.0)
-    fsm = watched.rig.stellar_loops["right"].fsm
-    watched.loops["right"].mirror.command_rad = part * fsm.range_rad * np.array(direction)
-    watched.invariants.motion.volts("right", np.full(3, 5.0), np.full(3, 5.0))
-
-    assert watched.go_on(0.1) == violated
 
 
 def fault(reason):
@@ -675,14 +415,6 @@ def test_a_sequence_that_is_ordered_to_end_must(run, state, violated):
     assert watched.go_on(3.0) == violated
 
 
-def test_a_mirror_may_go_back_to_its_bias_after_its_dac_has_moved_it():
-    watched = Rig(mode=Mode.SAFE)
-    watched.go_on(5.0)
-    watched.invariants.motion.mirror_moved("right")
-
-    assert swings(watched, 1.0) == []
-
-
 def test_amplifiers_that_keep_power_after_an_orderly_end_are_noticed():
     watched = Rig()
     watched.go_on(3.0)
@@ -716,3 +448,54 @@ def test_a_mistake_on_the_servos_thread_is_found_though_it_ends_in_safe(monkeypa
     monkeypatch.setattr(SiderostatServo, "_servo_by", mistaken)
 
     assert NO_EXCEPTION in run(*happenings, duration_s=8.0)
+
+
+# ------------------------------------------------------------ lease and rights
+
+
+STATUS = RecorderStatus(time_s=0.0, path="", records=0, lost=0, bytes_written=0)
+
+
+COMMANDS = (Release(), Stop(), Status(), TakeOver())
+
+
+def test_the_rules_of_the_service_are_those_of_the_invariant(time, invariants):
+    admission, random = Admission(30.0), Random(3)
+    for _ in range(500):
+        time.run_until(time.now_s() + random.expovariate(0.1))
+        sender = SENDERS[random.choice(list(SENDERS))]
+        command = random.choice(COMMANDS)
+        refusal = admission.refusal(sender, command, time.now_s())
+        invariants.admitted(sender, command, refusal)
+
+    assert invariants.violations == []
+
+
+@pytest.mark.parametrize(
+    ("who", "command", "refusal"),
+    [
+        ("dora", Stop(), ""),  # who may only watch
+        ("ben", Release(), ""),  # without the lease
+        ("ada", Release(), "no"),  # with it
+        ("ben", RecorderReport(status=STATUS), ""),  # which is for this machine's
+    ],
+)
+def test_more_or_less_than_ones_rights_is_a_violation(invariants, who, command, refusal):
+    invariants.admitted(SENDERS["ada"], Standby(), "")
+    assert invariants.violations == []
+
+    invariants.admitted(SENDERS[who], command, refusal)
+
+    assert [one.invariant for one in invariants.violations] == ["lease and rights are kept"]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "violated"), [("drops", []), ("saturated", ["a tick acts on the newest frame"])]
+)
+def test_a_tick_may_act_on_an_old_frame_where_newer_ones_are_lost(invariants, wrong, violated):
+    line = invariants._lines["camera"]
+    line.wrong[wrong] = 0.0
+    mid_exposure = {"mid_exposure_s": np.nan}
+    invariants.record(tick(1, loop="right", mode="STANDBY", frame_age_s=2.0, **mid_exposure))
+
+    assert [one.invariant for one in invariants.violations] == violated

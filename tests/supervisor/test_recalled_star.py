@@ -341,8 +341,10 @@ def test_a_command_that_gives_a_place_means_another_star(follows):
     other = Acquire(expected_az_sky_arcsec=50.0, expected_el_sky_arcsec=0.0)
     assert follows.command(other).accepted
     loop = follows.supervisor.stellar_loops["right"]
-    before_rad = loop.sky.turned_at(follows.clock.now_s())
-    assert loop.sky.turned_at(follows.clock.now_s() + 9.0).tolist() == before_rad.tolist()
+    before_rad = loop.star_motion.sky.turned_at(follows.clock.now_s())
+    assert (
+        loop.star_motion.sky.turned_at(follows.clock.now_s() + 9.0).tolist() == before_rad.tolist()
+    )
 
 
 @pytest.mark.long

@@ -41,18 +41,14 @@ _STAR = Wanted(
 class StarSearch(SpiralSearch):
     """One stellar loop's; :meth:`start_where_expected` begins it anew.
 
+    All angles are of motors that do not have to follow the star on the sky.
+
     Parameters
     ----------
     rig : Rig
     loop_name : str
     finder : StarFinder
         Knows where the star is expected, and where what a frame shows is.
-
-    Attributes
-    ----------
-    sky_rad : array, shape (2,)
-        How far the star has moved by itself, as an angle of the motors (:class:`fitctl.loop.sky.Sky`). All
-        angles of the search are of motors that did not have to follow it.
     """
 
     def __init__(self, rig: Rig, loop_name: str, finder: StarFinder) -> None:
@@ -64,7 +60,6 @@ class StarSearch(SpiralSearch):
         self._middle_px = np.array([rig.camera.width_px - 1, rig.camera.height_px - 1]) / 2
         scale = scales(rig, loop)
         self._scale = scale
-        self.sky_rad = np.zeros(2)
         self._asked = Acquire()
         self._overlap: float | None = None
         # What moved the light without a held beam turned the star by as much.
@@ -96,17 +91,18 @@ class StarSearch(SpiralSearch):
         """Where the next search is to begin, as a command asked; shape (2,)."""
         return asked_place_sky_arcsec(self._asked)
 
-    def start_where_expected(self, *, again: bool = False) -> None:
+    def start_where_expected(self, sky_rad: Floats, *, again: bool = False) -> None:
         """A new search, about where the star is expected now, or as a command asked.
 
-        With `again`, the star was followed until now: it is searched for in rounds, if the rig file allows it.
+        The star has moved by itself by `sky_rad`, shape (2,), as an angle of the motors. With `again`, it was
+        followed until now: it is searched for in rounds, if the rig file allows it.
         """
         place_sky_arcsec, asked, self._asked = self.asked_place_sky_arcsec, self._asked, Acquire()
         if self._attribution is not None:
             self._attribution.begin_search()
         if place_sky_arcsec is not None:
             place_px = self._target_px + self._scale.sky_px(place_sky_arcsec)
-            self._estimator.place(place_px, self.sky_rad, np.zeros(2))
+            self._estimator.place(place_px, sky_rad, np.zeros(2))
         self._overlap = asked.field_overlap
         # Two stars that were followed would lie on each other in the middle of the field.
         at_target = again and self._attribution is not None

@@ -168,7 +168,7 @@ def set_link_origin(s: Any, r: Any, rr: Any) -> None:
 
 @compilable()
 def follow_link(s: Any, r: Any, rr: Any) -> None:
-    """``StellarLoop._follow_link``."""
+    """``StarMotion.undo`` of the link."""
     az_rad, el_rad = r.undone_rad[0], r.undone_rad[1]
     if r.mode not in (ACQUISITION, COARSE, VERNIER):
         undo_to_setpoint(s, r, rr)
@@ -179,7 +179,7 @@ def follow_link(s: Any, r: Any, rr: Any) -> None:
 
 @compilable()
 def follow_sky(s: Any, r: Any, rr: Any) -> None:
-    """``StellarLoop._follow_sky``."""
+    """``StarMotion.undo`` of the sky."""
     light_arrives = s.link < 0 or rr.beams[s.link].mode == LOCKED
     if r.mode in (ACQUISITION, COARSE, VERNIER) and not (light_arrives and r.search_due == NOT_DUE):
         return
