@@ -9,6 +9,7 @@ from fitctl.config.collector import Collector, CollectorGeometry, CollectorMotio
 from fitctl.config.devices import (
     AIN_RANGES_V,
     HALF_WINDOW_PX,
+    WINDOW_PX,
     BalAnalogDevice,
     C887Device,
     Camera,
@@ -72,6 +73,7 @@ __all__ = [
     "LEAST_OVERLAP",
     "MOST_OVERLAP",
     "QUANTITIES",
+    "WINDOW_PX",
     "Action",
     "AirPath",
     "AirPathModel",

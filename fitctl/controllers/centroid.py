@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import HALF_WINDOW_PX, Camera, Loop, OtherSpot
+from fitctl.config import HALF_WINDOW_PX, WINDOW_PX, Camera, Loop, OtherSpot
 from fitctl.controllers.dark import Dark
 from fitctl.controllers.spot_fit import SpotFit, spot_fit
 from fitctl.model.compiled import compilable
@@ -295,9 +295,7 @@ def sensor_noise_px(camera: Camera, loop: Loop, star_flux_dn: float) -> float:
 
 def _noise_px(fit: SpotFit | None, camera: Camera, loop: Loop, star_flux_dn: float) -> float:
     if fit is None:
-        return centroid_noise_px(
-            camera, star_flux_dn, 2 * HALF_WINDOW_PX + 1, loop.spot_diameter_px
-        )
+        return centroid_noise_px(camera, star_flux_dn, WINDOW_PX, loop.spot_diameter_px)
     return fit.noise_px(star_flux_dn)
 
 

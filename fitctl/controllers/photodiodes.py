@@ -199,14 +199,6 @@ def capture_radius_m(sensor: Sensor, detection_sigma: float) -> float:
     return aside_m + math.sqrt(reach**2 - aside_m**2) if reach > aside_m else 0.0
 
 
-def measured_radius_m(sensor: Sensor, detection_sigma: float) -> float:
-    """From the array's centre: a beam within it gives light to all four diodes, whatever its direction.
-
-    The worst direction is away from a diode.
-    """
-    return max(0.0, reach_m(sensor, detection_sigma) - sensor.diode_offset_m)
-
-
 def ambient_of(samples_v: Floats) -> tuple[Floats, Floats]:
     """Ambient light of each diode and its standard error, shapes (4,), from samples without the beam.
 

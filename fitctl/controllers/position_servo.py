@@ -8,8 +8,7 @@ from typing import Any
 
 from fitctl.config import Siderostat
 from fitctl.model.compiled import compilable
-
-AzEl = tuple[float, float]
+from fitctl.model.optics import AzEl
 
 
 @dataclass(slots=True)

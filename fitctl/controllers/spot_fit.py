@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import HALF_WINDOW_PX
+from fitctl.config import HALF_WINDOW_PX, WINDOW_PX
 from fitctl.model.compiled import compilable
 from fitctl.model.image.light import light_below
 
@@ -33,8 +33,7 @@ NODES = int(REACH_PX * STEPS_PER_PX)
 PLACES = 2 * NODES + 1  # along an axis
 # Of the nodes, those of the middle pixel.
 _PIXEL = (slice(NODES - STEPS_PER_PX // 2, NODES + STEPS_PER_PX // 2),) * 2
-_SIDE = 2 * HALF_WINDOW_PX + 1
-_EDGES_PX = np.arange(_SIDE + 1) - _SIDE / 2
+_EDGES_PX = np.arange(WINDOW_PX + 1) - WINDOW_PX / 2
 _SLOPE_STEP_PX = 1e-3
 _EXACT_PX = 1e-4  # an error between nodes that is smaller, RMS, does not count (choice)
 # A pixel is left out if it misses the fit by so many standard deviations.

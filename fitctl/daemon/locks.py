@@ -17,10 +17,9 @@ from fitctl.config import (
     ModbusDacDevice,
     Rig,
 )
+from fitctl.config.addresses import SOCKET_URL
 from fitctl.messages.endpoints import supervisor_name
 from fitctl.processes import lock_held, name_held
-
-_SOCKET_URL = "socket://"
 
 
 @contextmanager
@@ -105,8 +104,8 @@ def _modbus(device: ModbusDacDevice) -> str:
 
 def _port(port: str) -> str:
     """A serial port by the file that its links lead to, or a socket."""
-    if port.startswith(_SOCKET_URL):
-        host, _, number = port.removeprefix(_SOCKET_URL).partition("/")[0].rpartition(":")
+    if port.startswith(SOCKET_URL):
+        host, _, number = port.removeprefix(SOCKET_URL).partition("/")[0].rpartition(":")
         return _host(host, number)
     return os.path.realpath(port)
 

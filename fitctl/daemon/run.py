@@ -55,7 +55,7 @@ from fitctl.service.service import Service
 from fitctl.service.telemetry_buffer import ServiceState, TelemetryBuffer
 from fitctl.stages.periodic import PeriodicThread
 from fitctl.stages.realtime import (
-    Collector,
+    GarbageCollector,
     become_realtime,
     lock_memory,
     quiet_interpreter,
@@ -191,7 +191,7 @@ def run_supervisor(
         service = Service(supervisor, buffer, folder, state, clock)
         threads = [PeriodicThread(work, clock) for work in supervisor.periodic]
         quiet_interpreter()
-        collector = Collector()
+        collector = GarbageCollector()
         service.start()
         for thread in threads:
             thread.start()

@@ -11,7 +11,7 @@ from typing import Generic, Protocol, TypeVar
 from fitctl.config import Siderostat
 from fitctl.config.base import Settings
 from fitctl.drivers.endpoint import Endpoint
-from fitctl.drivers.interface import AzEl, DeviceError, DeviceFault, DeviceUnreachable
+from fitctl.drivers.interface import AzEl, DeviceError, DeviceFault
 from fitctl.drivers.plausibility import MotionCheck
 
 DEVICE = "siderostat amplifiers"
@@ -88,9 +88,7 @@ class LinkedAmplifiers(ABC, Generic[_Link, _Settings]):
 
     def _opened(self) -> _Link:
         if self._link is None:
-            raise self._endpoint.error(
-                DeviceUnreachable, "an open connection", "a closed one", "open it first"
-            )
+            raise self._endpoint.not_open()
         return self._link
 
     def _limited(self, velocity_rad_s: AzEl) -> AzEl:

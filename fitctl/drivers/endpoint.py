@@ -24,6 +24,10 @@ class Endpoint:
         """An error of this device; fields as in :class:`~fitctl.drivers.interface.DeviceError`."""
         return kind(self.device, self.address, expected, got, hint)
 
+    def not_open(self) -> DeviceUnreachable:
+        """The error of a driver that is used before it is opened, or after it was closed."""
+        return self.error(DeviceUnreachable, "an open connection", "none", "open it again")
+
     def open_serial(
         self, expected: str, hint: str, *, baud_rate: int, poll_s: float, write_timeout_s: float
     ) -> serial.Serial:

@@ -8,7 +8,8 @@ voltages are at the D/A unless said otherwise. Pairs are azimuth, then elevation
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -179,6 +180,9 @@ class ServoReading(NamedTuple):
     position_rad: AzEl
     enabled: bool
     fault: str
+
+
+NO_READING = ServoReading(math.nan, (math.nan, math.nan), enabled=False, fault="")
 
 
 class ServoAmplifiers(Protocol):
@@ -371,6 +375,15 @@ class Pose(NamedTuple):
     u_deg: float = 0.0
     v_deg: float = 0.0
     w_deg: float = 0.0
+
+
+def beyond_travel(
+    pose: Pose, ends: Iterable[tuple[float, float]]
+) -> Iterator[tuple[str, float, float, float]]:
+    """Each part of a pose that is beyond its travel: its name, its value and the travel's two ends."""
+    for name, value, (low, high) in zip(Pose._fields, pose, ends, strict=True):
+        if not low <= value <= high:
+            yield name, value, low, high
 
 
 class HexapodReading(NamedTuple):

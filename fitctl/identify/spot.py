@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import HALF_WINDOW_PX, Camera, Loop, Rig
+from fitctl.config import HALF_WINDOW_PX, WINDOW_PX, Camera, Loop, Rig
 from fitctl.controllers.centroid import StarSensor
 from fitctl.controllers.dark import Dark
 from fitctl.controllers.spot_fit import gaussian_shape
@@ -34,8 +34,7 @@ LEAST_FRAMES = 100
 MOST_FRAMES = 3000
 NOT_ROUND = 2.0
 """A round Gaussian leaves the pixels' noise; more than so many times that is another shape."""
-_SIDE = 2 * HALF_WINDOW_PX + 1
-_LEAST_PIXELS = _SIDE**2 // 2 + 1  # of a window, that are neither bad nor saturated
+_LEAST_PIXELS = WINDOW_PX**2 // 2 + 1  # of a window, that are neither bad nor saturated
 _AMOUNTS = 5  # of a frame: flux, two coordinates, width, background
 _NARROWEST_PX, _WIDEST_PX = 1.0, 8.0
 _STEPS, _ENOUGH_PX = 30, 1e-5
@@ -104,9 +103,9 @@ class SpotResult:
         farthest_px = float(self.distance_px.max())
         at_px = np.linspace(0.0, farthest_px, 200)
         shape = [
-            gaussian_shape(self.diameter_px, np.array(one), np.array(0.0)).reshape(_SIDE, _SIDE)[
-                HALF_WINDOW_PX, HALF_WINDOW_PX
-            ]
+            gaussian_shape(self.diameter_px, np.array(one), np.array(0.0)).reshape(
+                WINDOW_PX, WINDOW_PX
+            )[HALF_WINDOW_PX, HALF_WINDOW_PX]
             for one in at_px
         ]
         axes.plot(at_px, shape, color=BLACK, label=f"Gaussian, {self.diameter_px:.3f} px")
@@ -146,7 +145,7 @@ def analyse(rig: Rig, loop_name: str, frames: Iterable[TimedImage]) -> SpotResul
     light = np.maximum(flux_dn[:, None] * shape, 0.0)
     expected_dn2 = camera.pixel_noise_dn**2 + photon_dn * light
     freedom = np.count_nonzero(windows.counts) - _AMOUNTS * len(flux_dn)
-    centres = np.arange(_SIDE) - HALF_WINDOW_PX
+    centres = np.arange(WINDOW_PX) - HALF_WINDOW_PX
     el_at, az_at = np.meshgrid(centres, centres, indexing="ij")
     few = slice(None, None, max(1, len(flux_dn) // 100))
     counts = windows.counts[few]
@@ -191,12 +190,12 @@ def _windows(frames: Iterable[TimedImage], camera: Camera, loop: Loop) -> _Windo
         if star is None:
             continue
         el, az = star.window_el_px - HALF_WINDOW_PX, star.window_az_px - HALF_WINDOW_PX
-        good = np.ones(_SIDE**2, dtype=bool)
-        good[list(dark.without_measurement(image, el, az, _SIDE, _SIDE))] = False
+        good = np.ones(WINDOW_PX**2, dtype=bool)
+        good[list(dark.without_measurement(image, el, az, WINDOW_PX, WINDOW_PX))] = False
         if np.count_nonzero(good) < _LEAST_PIXELS:
             spoilt += 1
             continue
-        lights_dn.append(dark.light(image, el, az, _SIDE, _SIDE).ravel().copy())
+        lights_dn.append(dark.light(image, el, az, WINDOW_PX, WINDOW_PX).ravel().copy())
         counts.append(good)
         if len(counts) == MOST_FRAMES:
             break
@@ -259,7 +258,7 @@ def _fit(
     """
     light_dn, counts = windows
     # From a centre of gravity.
-    centres = np.arange(_SIDE) - float(HALF_WINDOW_PX)
+    centres = np.arange(WINDOW_PX) - float(HALF_WINDOW_PX)
     el_at, az_at = (one.ravel() for one in np.meshgrid(centres, centres, indexing="ij"))
     flux_dn = light_dn.sum(axis=1)
     values = np.column_stack(
@@ -284,7 +283,7 @@ def _fit(
         each_px = diameter_px + steps[:, 3]
         wider_px = float(np.median(steps[:, 3]))
         values = values + steps[:, [0, 1, 2, 4]]
-        diameter_px = float(np.clip(diameter_px + wider_px, 0.5, 2 * _SIDE))
+        diameter_px = float(np.clip(diameter_px + wider_px, 0.5, 2 * WINDOW_PX))
         if abs(wider_px) < _ENOUGH_PX:
             break
     return float(np.mean(each_px)), each_px, values, left_dn

@@ -264,9 +264,7 @@ def _looks_slow(line_hz: float, rate_hz: float, others: Sequence[Opened]) -> boo
     return any(_look_alike(hz, line_hz, others) for hz in faster)
 
 
-def _places_hz(
-    line_hz: float, rate_hz: float, other_hz: float, multiples: int = _MULTIPLES
-) -> list[float]:
+def _places_hz(line_hz: float, rate_hz: float, other_hz: float, multiples: int) -> list[float]:
     """Where a line that is seen at `line_hz` may be seen at another rate: first if it is no alias."""
     true_hz = _true_hz(line_hz, rate_hz, multiples)
     return [max(LEAST_LINE_HZ, seen_at_hz(hz, other_hz)) for hz in true_hz]

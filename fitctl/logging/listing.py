@@ -25,29 +25,36 @@ def rig_name(log: LogInfo) -> str:
     return log.metadata.get("rig", {}).get("name", "")
 
 
-def newest_run(folder: Path, rig: str) -> list[Path]:
+def run_of(log: LogInfo) -> tuple[str, ...]:
+    """The same for all files of a run: rig, and the two clocks at its start."""
+    return rig_name(log), *log.metadata.get("clock", {}).values()
+
+
+def newest_run(folder: Path, rig: str | None = None) -> list[Path]:
     """All files of the newest run of a rig, oldest first, as ``--latest`` chooses them.
 
     Names are not compared: a log counts by its first record, whatever its file is called. What `fitctl log`
-    cut, merged or recovered counts only where none of the run's own files is left.
+    cut or recovered counts only where none of the run's own files is left; a log that it merged from several
+    runs does not count, nor does a file that cannot be read.
 
     Parameters
     ----------
     folder : Path
         Folder of logs, `logging.folder` of the rig file.
-    rig : str
-        Name of the rig.
+    rig : str, optional
+        Name of the rig; without it, of whichever rig the newest run is.
 
     Returns
     -------
     list of Path
         Empty if the folder has no log of this rig.
     """
-    of_rig = [log for log in logs_in(folder)[0] if log.counts and rig_name(log) == rig]
-    if not of_rig:
-        return []
-    clock = of_rig[-1].metadata.get("clock")
-    run = [log for log in of_rig if log.metadata.get("clock") == clock]
+    logs = [
+        log
+        for log in logs_in(folder)[0]
+        if log.counts and log.runs <= 1 and "rig" in log.metadata and rig in {None, rig_name(log)}
+    ]
+    run = [log for log in logs if run_of(log) == run_of(logs[-1])]
     return [log.path for log in recorded(run)]
 
 

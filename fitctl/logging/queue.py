@@ -94,14 +94,8 @@ class RecordQueue:
         """Those of the waiting that this recorder was not yet sent."""
         return len(self._kept) - self._sent
 
-    def offer(self, record: AnyRecord) -> bool:
-        """Take a record for the log, at once.
-
-        Returns
-        -------
-        bool
-            False if the queue is full; the record is then counted in ``lost``.
-        """
+    def offer(self, record: AnyRecord) -> None:
+        """Take a record for the log, at once; if the queue is full, count it in ``lost``."""
         sequence = self._next_sequence
         self._next_sequence += 1
         filling = 2 * len(self._kept) >= self._size
@@ -112,11 +106,9 @@ class RecordQueue:
             self._run_info = record
         if len(self._kept) >= self._size:
             self.lost += 1
-            self._send(_STEPS_PER_OFFER)
-            return False
-        self._kept.append((sequence, _encode(Envelope(RECORD_VERSION, sequence, record))))
+        else:
+            self._kept.append((sequence, _encode(Envelope(RECORD_VERSION, sequence, record))))
         self._send(_STEPS_PER_OFFER)
-        return True
 
     def pump(self) -> None:
         """Hear the recorder and go on sending, without a new record: for quiet times."""

@@ -20,12 +20,12 @@ from fitctl.controllers.frame_counts import count_sample
 from fitctl.controllers.photodiodes import Beam, BeamState, PhotodiodeArray
 from fitctl.controllers.spiral import plan_beam_spiral
 from fitctl.drivers.interface import (
+    NO_READING,
     DeviceError,
     DiodeReading,
     Frame,
     LoopDevices,
     Photodiodes,
-    ServoReading,
 )
 from fitctl.logging.records import BeamPlace, MetrologyTick
 from fitctl.loop.loop import Loop
@@ -52,7 +52,6 @@ PULL_IN = (
     0.5  # of the motors' velocity limit: faster, a beam that is far off is not pulled in (choice)
 )
 MOST_TICK_S = 0.1  # a longer wait between two ticks counts as this: the law was not made for it
-_NO_READING = ServoReading(math.nan, (math.nan, math.nan), enabled=False, fault="")
 _NO_SAMPLE = DiodeReading(math.nan, (math.nan,) * 4)
 _NO_BEAM = Beam(BeamState.LOST, math.nan, math.nan, math.nan, math.nan, math.nan)
 
@@ -377,7 +376,7 @@ class MetrologyLoop(Loop):
         """What the tick was decided by, and what it did."""
         sensed, frame = self._sensed, self._sensed.frame
         sample, beam = sensed.sample or _NO_SAMPLE, sensed.beam or _NO_BEAM
-        read_s, (encoder_az_rad, encoder_el_rad), *_ = sensed.servo.reading or _NO_READING
+        read_s, (encoder_az_rad, encoder_el_rad), *_ = sensed.servo.reading or NO_READING
         arcsec_per_m = ARCSEC_PER_RAD / self.settings.sensor.link_length_m
         arcsec_per_rad = self._motor_sky * ARCSEC_PER_RAD
         rate_az_rad_s, rate_el_rad_s = self.hold.rate_rad_s.tolist()

@@ -597,14 +597,13 @@ class StellarLoop(Loop):
         why = f": {reason}" if reason else ""
         self._report_event("info", f"controller {before} -> {design.title}{why}")
 
-    def start_experiment(self, name: str, drives: list[Drive]) -> bool:
-        """Make an experiment's motions from the next tick on; False in a mode without a star."""
+    def start_experiment(self, name: str, drives: list[Drive]) -> None:
+        """Make an experiment's motions from the next tick on; nothing in a mode without a star."""
         now_s = self._clock.now_s()
         if not self.fire(Trigger.EXPERIMENT, name):
-            return False
+            return
         self._held_undone_rad = self.star_motion.undone_rad
         self._experiments.begin(name, drives, self.siderostat, self.mirror, now_s)
-        return True
 
     def _end_experiment(self) -> None:
         held_rad = self._experiments.end(self.mirror)
@@ -624,7 +623,9 @@ class StellarLoop(Loop):
         centre_rad, link = self.search.centre_rad - self.star_motion.sky_rad, self.star_motion.link
         if link is not None:
             centre_rad = centre_rad - link.undone_from_origin_rad
-        centre_sky_arcsec = (centre_rad * scale.motor_sky_arcsec_per_rad).tolist()
+        centre_sky_arcsec = (
+            centre_rad * self.settings.siderostat.sky_arcsec_per_motor_rad
+        ).tolist()
         az_urad, el_urad = (1e6 * self.mirror.bias_offset_rad).tolist()
         return LoopState(
             name=self.name,
@@ -673,7 +674,9 @@ class StellarLoop(Loop):
                 "warning", "encoders read elsewhere than before; the star's place is forgotten"
             )
         elif self.servo.turned_on_rad:
-            turned_arcsec = self.servo.turned_on_rad * self._scale.motor_sky_arcsec_per_rad
+            turned_arcsec = (
+                self.servo.turned_on_rad * self.settings.siderostat.sky_arcsec_per_motor_rad
+            )
             self._report_event(
                 "warning",
                 f"the siderostat turned on by {turned_arcsec:.0f} arcsec on the sky while its amplifiers did "

@@ -6,17 +6,14 @@ import math
 from typing import NamedTuple
 
 from fitctl.config import Rig
-from fitctl.drivers.interface import ServoReading
+from fitctl.drivers.interface import NO_READING
 from fitctl.logging.records import Tick
 from fitctl.loop.observation import Observation
 from fitctl.loop.pointing import Pointing
 from fitctl.loop.search.spiral import SpiralSearch
 from fitctl.messages.modes import Mode
-from fitctl.model.optics import scales
 from fitctl.stages.mirror import MirrorStage
 from fitctl.stages.siderostat import SiderostatStage
-
-_NO_READING = ServoReading(math.nan, (math.nan, math.nan), enabled=False, fault="")
 
 
 class TickTimes(NamedTuple):
@@ -41,7 +38,7 @@ class TickRecords:
         self._loop_name = loop_name
         self._due_after_s = rig.camera.frame_delay_s + rig.supervisor.late_tick_s
         self._range_rad = loop.fsm.range_rad
-        self._sky_arcsec_per_rad = scales(rig, loop).motor_sky_arcsec_per_rad
+        self._sky_arcsec_per_rad = loop.siderostat.sky_arcsec_per_motor_rad
 
     def make(
         self,
@@ -59,7 +56,7 @@ class TickRecords:
         sensed_s, decided_s, done_s = times
         frame, star, servo = observation.frame, observation.star, observation.servo
         begun_s, sky_arcsec_per_rad = observation.now_s, self._sky_arcsec_per_rad
-        read_s, (encoder_az_rad, encoder_el_rad), *_ = servo.reading or _NO_READING
+        read_s, (encoder_az_rad, encoder_el_rad), *_ = servo.reading or NO_READING
         exposed_s = math.nan if frame is None else frame.mid_exposure_s
         star_az_px, star_el_px = (math.nan, math.nan) if star is None else star[:2]
         target_az_px, target_el_px = pointing.command_px

@@ -10,8 +10,8 @@ from fitctl.messages.commands import Reply
 from fitctl.messages.running import supervisor_runs
 from fitctl.messages.telemetry import CommandOutcome, Telemetry
 
-_RECEIVE_S = 0.5
-_SILENCE_S = 5.0
+RECEIVE_S = 0.5
+SILENCE_S = 5.0
 _GONE_S = 2.0  # silence of a supervisor that was told to end
 
 
@@ -47,7 +47,7 @@ def wait_for_outcomes(link: Link, reply: Reply, timeout_s: float) -> dict[str, C
     begun_s = heard_s = link.now_s()
     pid, found = 0, {}
     while True:
-        telemetry, now_s = link.receive(_RECEIVE_S), link.now_s()
+        telemetry, now_s = link.receive(RECEIVE_S), link.now_s()
         if telemetry is not None and telemetry.time_s >= reply.time_s:
             heard_s, found = now_s, _of_number(telemetry, reply.number)
             if not found or pid not in {0, telemetry.pid}:
@@ -57,8 +57,8 @@ def wait_for_outcomes(link: Link, reply: Reply, timeout_s: float) -> dict[str, C
         ended = bool(found) and all(each.state != "under way" for each in found.values())
         if ended or (found and now_s - begun_s >= timeout_s):
             return found
-        if now_s - heard_s > _SILENCE_S:
-            msg = f"the supervisor has sent no telemetry for {_SILENCE_S:g} s; see fitctl status"
+        if now_s - heard_s > SILENCE_S:
+            msg = f"the supervisor has sent no telemetry for {SILENCE_S:g} s; see fitctl status"
             raise ConnectionError(msg)
 
 
@@ -79,7 +79,7 @@ def wait_for_end(client: Client, timeout_s: float) -> bool:
     """
     end_s = time.monotonic() + timeout_s
     while True:
-        silent = client.receive(_RECEIVE_S if client.folder else _GONE_S) is None
+        silent = client.receive(RECEIVE_S if client.folder else _GONE_S) is None
         if silent and (client.folder is None or not supervisor_runs(client.folder)):
             return True
         if time.monotonic() >= end_s:

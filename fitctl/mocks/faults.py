@@ -60,13 +60,11 @@ class Faults:
     ----------
     kinds : mapping
         What can go wrong with it: `WIRE_FAULTS` and its own.
-    seed : int
-        Of what happens with a probability.
     """
 
-    def __init__(self, kinds: Mapping[str, FaultKind], seed: int = 0) -> None:
+    def __init__(self, kinds: Mapping[str, FaultKind]) -> None:
         self.kinds = kinds
-        self._random = random.Random(seed)  # noqa: S311 - not for secrets
+        self._random = random.Random(0)  # noqa: S311 - not for secrets
         self._active: dict[tuple[str, str], Fault] = {}
         self._ends: dict[tuple[str, str], asyncio.TimerHandle] = {}
         self._watchers: list[Callable[[str], None]] = []

@@ -102,12 +102,12 @@ def bridge_weights(steps: int, step_s: float) -> Floats:
     )
 
 
-def bridge_rms_px(air: AirPathModel, node_s: float = NODE_S) -> float:
+def bridge_rms_px(air: AirPathModel) -> float:
     """RMS, halfway between nodes, of what the cubic leaves out: q h^3 / 192 of an integrated random walk.
 
     So close together the filter's own poles do not matter; q is the intensity of the rate's noise.
     """
-    return float(air.gain_px / air.b1_s2 * np.sqrt(node_s**3 / 192))
+    return float(air.gain_px / air.b1_s2 * np.sqrt(NODE_S**3 / 192))
 
 
 @compilable(inline=True, fused=True)

@@ -154,13 +154,11 @@ class HexapodMotion:
         return next((plan for since_s, plan in plans if since_s <= time_s), self._plans[0][1])
 
 
-def at_rest(pose: Sequence[float] | Floats, time_s: float = 0.0) -> Trajectory:
+def at_rest(pose: Sequence[float] | Floats) -> Trajectory:
     """A hexapod that stands still."""
     where = np.array(pose, dtype=np.float64)
     still = np.zeros((4, AXES))
-    return Trajectory(
-        where, time_s, np.full((4, AXES), time_s), np.tile(where, (4, 1)), still, still
-    )
+    return Trajectory(where, 0.0, np.zeros((4, AXES)), np.tile(where, (4, 1)), still, still)
 
 
 def plan_move(

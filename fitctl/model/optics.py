@@ -29,8 +29,6 @@ class Scales:
     ----------
     sky_px_per_rad : float
         Beam angle on the sky, before the compressor, to focal plane: k_comp f_i / pixel.
-    motor_sky_rad_per_rad : float
-        Siderostat motor to beam on the sky: 2 p / (GR_spur r_arm).
     motor_px_per_rad : float
         Siderostat motor to focal plane: 1.437e-4 m/rad on FIT.
     mirror_px_per_rad : float
@@ -47,7 +45,6 @@ class Scales:
     """
 
     sky_px_per_rad: float
-    motor_sky_rad_per_rad: float
     motor_px_per_rad: float
     mirror_px_per_rad: float
     siderostat_turn: Floats
@@ -61,11 +58,6 @@ class Scales:
     def sky_arcsec_per_px(self) -> float:
         """Beam angle on the sky of one pixel."""
         return ARCSEC_PER_RAD / self.sky_px_per_rad
-
-    @property
-    def motor_sky_arcsec_per_rad(self) -> float:
-        """Beam angle on the sky of one radian of motor."""
-        return self.motor_sky_rad_per_rad * ARCSEC_PER_RAD
 
     # All of these take and give shape (..., 2).
 
@@ -95,13 +87,11 @@ def scales(rig: Rig, loop: Loop) -> Scales:
     pixel_size_m = rig.camera.pixel_size_m
     siderostat = loop.siderostat
     px_per_rad = sky_px_per_rad(rig)
-    motor_sky = siderostat.sky_rad_per_motor_rad
     siderostat_turn = stage_turn(siderostat.rotation_deg, siderostat.axis_gains)
     mirror_turn = stage_turn(loop.fsm.rotation_deg, loop.fsm.axis_gains)
     return Scales(
         sky_px_per_rad=px_per_rad,
-        motor_sky_rad_per_rad=motor_sky,
-        motor_px_per_rad=motor_sky * px_per_rad,
+        motor_px_per_rad=siderostat.sky_rad_per_motor_rad * px_per_rad,
         mirror_px_per_rad=loop.fsm.beam_per_mirror * rig.optics.focal_length_m / pixel_size_m,
         siderostat_turn=siderostat_turn,
         mirror_turn=mirror_turn,

@@ -126,7 +126,9 @@ def plant_constants(rig: Rig, loop_name: str, star_offset_px: Floats) -> PlantCo
     transition, gain = structure.mode_matrices(plant.structure, truth.step_s)
     target = np.array([loop.target_px.az, loop.target_px.el])
     spot_offset = np.array([[spot.offset_px.az, spot.offset_px.el] for spot in plant.spots])
-    backlash_rad = plant.backlash_sky_arcsec / ARCSEC_PER_RAD / scale.motor_sky_rad_per_rad
+    backlash_rad = (
+        plant.backlash_sky_arcsec / ARCSEC_PER_RAD / loop.siderostat.sky_rad_per_motor_rad
+    )
     return PlantConstants(
         step_s=truth.step_s,
         amplifier_decay=float(np.exp(-truth.step_s / lag_s)),

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 from fitctl.config import CONTROLLERS, Rig, is_name, rig_from_log
 from fitctl.logging.errors import LogError
-from fitctl.logging.listing import recorded
-from fitctl.logging.reading import LogInfo, log_info, logs_of_one_run_each
+from fitctl.logging.listing import newest_run, run_of
+from fitctl.logging.reading import LogInfo, logs_of_one_run_each
 from fitctl.logging.schemas import designs_of
 
 
@@ -67,16 +67,18 @@ def find_run(paths: Sequence[Path], rig: Rig | None = None, overrides: Sequence[
         If the rig in the log is none that this fitctl understands.
     """
     if len(paths) == 1 and paths[0].is_dir():
-        logs = _newest_run(paths[0])
-    else:
-        logs = logs_of_one_run_each(paths)
-        for log in logs[1:]:
-            if _identity(log) != _identity(logs[0]):
-                msg = (
-                    f"{log.path}: is of another run than {logs[0].path}; report each alone, or put them "
-                    "side by side with --compare"
-                )
-                raise LogError(msg)
+        folder, paths = paths[0], newest_run(paths[0])
+        if not paths:
+            msg = f"{folder}: holds no log of fitctl (*.mcap); name a file, or the rig's logging.folder"
+            raise LogError(msg)
+    logs = logs_of_one_run_each(paths)
+    for log in logs[1:]:
+        if _identity(log) != _identity(logs[0]):
+            msg = (
+                f"{log.path}: is of another run than {logs[0].path}; report each alone, or put them "
+                "side by side with --compare"
+            )
+            raise LogError(msg)
     with_records = sorted((log for log in logs if log.counts), key=lambda log: log.start_s)
     logs = with_records or logs[:1]
     return Run(
@@ -87,23 +89,11 @@ def find_run(paths: Sequence[Path], rig: Rig | None = None, overrides: Sequence[
     )
 
 
-def _newest_run(folder: Path) -> list[LogInfo]:
-    logs = [log_info(path) for path in sorted(folder.glob("*.mcap"))]
-    logs = [log for log in logs if "rig" in log.metadata and log.counts and log.runs <= 1]
-    if not logs:
-        msg = f"{folder}: holds no log of fitctl (*.mcap); name a file, or the rig's logging.folder"
-        raise LogError(msg)
-    newest = max(logs, key=lambda log: log.start_s)
-    return recorded([log for log in logs if _identity(log) == _identity(newest)])
-
-
 def _identity(log: LogInfo) -> tuple[str, ...]:
-    """The same for all files of a run: rig, and the two clocks at its start."""
     if "rig" not in log.metadata:
         msg = f"{log.path}: has no rig in it; name a log that fitctl recorded"
         raise LogError(msg)
-    clock = log.metadata.get("clock", {})
-    return log.metadata["rig"].get("name", ""), *clock.values()
+    return run_of(log)
 
 
 def _controllers_of(log: LogInfo) -> list[str]:

@@ -14,12 +14,11 @@ from fitctl.config import Rig
 from fitctl.messages.commands import Reply, SequenceReport, SequenceStatus
 from fitctl.messages.modes import Mode
 from fitctl.messages.telemetry import Telemetry
+from fitctl.messages.waiting import RECEIVE_S, SILENCE_S
 from fitctl.sequences.links import Link
 from fitctl.sequences.view import SequenceError, View
 
 MESSAGE_CHARS = 300
-_RECEIVE_S = 0.5
-_SILENCE_S = 5.0
 _REPORT_S = 1.0
 
 
@@ -118,14 +117,14 @@ class Contact:
     def _receive(self) -> Telemetry:
         begun_s = self.link.now_s()
         while True:
-            telemetry = self.link.receive(_RECEIVE_S)
+            telemetry = self.link.receive(RECEIVE_S)
             if telemetry is not None:
                 return telemetry
             if self.stop_wanted.is_set():
                 msg = "stopped by its program"
                 raise Stopped(msg, release=True)
-            if self.link.now_s() - begun_s > _SILENCE_S:
-                msg = f"the supervisor has been silent for {_SILENCE_S:g} s; check it, then start again"
+            if self.link.now_s() - begun_s > SILENCE_S:
+                msg = f"the supervisor has been silent for {SILENCE_S:g} s; check it, then start again"
                 raise ConnectionError(msg)
 
     def _obey(self, view: View) -> None:

@@ -18,6 +18,8 @@ from fitctl.messages.commands import MAX_COMMAND_BYTES
 from fitctl.service.admission import Sender
 
 QUEUED = 64  # messages of one connection
+ROUND_MS = 5
+MESSAGES_A_ROUND = 8
 _QUEUED_TELEMETRY = 50
 _LINGER_MS = 200
 _FRAMES = 3  # of a message: identity, tag, payload

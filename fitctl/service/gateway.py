@@ -26,15 +26,13 @@ from fitctl.messages.commands import Reply
 from fitctl.messages.endpoints import GATEWAY_SOCKET, TELEMETRY_SOCKET, SocketFolder
 from fitctl.messages.keys import AllowedKey
 from fitctl.processes import give_way
-from fitctl.service.doors import QUEUED, Parcel, frame_property
+from fitctl.service.doors import MESSAGES_A_ROUND, QUEUED, ROUND_MS, Parcel, frame_property
 from fitctl.service.envelope import Passed, Report
 from fitctl.service.intake import Intake, Limit
 from fitctl.service.keyed_door import KeyedDoor
 
 _NICENESS = 10
 _MOST_BYTES = 512 * 2**20
-_ROUND_MS = 5
-_MESSAGES_A_ROUND = 8
 _HANDSHAKES_A_ROUND = 4
 _DROPPED_A_ROUND = 200  # messages that are neither passed on nor answered
 _LOOK_S = 0.1
@@ -163,7 +161,7 @@ class Gateway:
                 self._pass_replies()
                 self._pass_telemetry()
                 if busy:
-                    ending.wait(_ROUND_MS / 1000)
+                    ending.wait(ROUND_MS / 1000)
         finally:
             self._supervisor.close()
             self._telemetry.close()
@@ -193,7 +191,7 @@ class Gateway:
         """Take some, as long as the supervisor takes them too; the rest waits with its sender."""
         served = 0
         for _ in range(_DROPPED_A_ROUND):
-            if served == _MESSAGES_A_ROUND or not self._supervisor.poll(0, zmq.POLLOUT):
+            if served == MESSAGES_A_ROUND or not self._supervisor.poll(0, zmq.POLLOUT):
                 return
             for parcel in self._keyed.door.receive(1):
                 served += self._receive(parcel)

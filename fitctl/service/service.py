@@ -41,7 +41,14 @@ from fitctl.messages.endpoints import (
 )
 from fitctl.messages.keys import AllowedKey
 from fitctl.service.admission import Admission, Sender
-from fitctl.service.doors import Door, local_sender, publisher_socket, router_socket
+from fitctl.service.doors import (
+    MESSAGES_A_ROUND,
+    ROUND_MS,
+    Door,
+    local_sender,
+    publisher_socket,
+    router_socket,
+)
 from fitctl.service.envelope import MAX_ENVELOPE_BYTES, Passed, Report, decode_envelope
 from fitctl.service.intake import Intake
 from fitctl.service.telemetry_buffer import ServiceState, TelemetryBuffer
@@ -49,8 +56,6 @@ from fitctl.supervisor.supervisor import Supervisor
 
 SOURCE = "service"  # of its events
 GATEWAY = "gateway"  # of what that tells
-_ROUND_MS = 5
-_MESSAGES_A_ROUND = 8
 _JOINED_STOPS = 1000
 _REPORT_PERIOD_S = 0.25
 _SNAPSHOT_PERIOD_S = 1.0  # of what a console shows of a log
@@ -127,10 +132,10 @@ class Service(threading.Thread):
         publish_s = report_s = self._clock.now_s()
         try:
             while not self._ending.is_set():
-                if poller.poll(_ROUND_MS):
+                if poller.poll(ROUND_MS):
                     self._serve()
                     self._send_replies()
-                    self._ending.wait(_ROUND_MS / 1000)  # however much more there is
+                    self._ending.wait(ROUND_MS / 1000)  # however much more there is
                 self._send_replies()
                 now_s = self._clock.now_s()
                 if now_s >= publish_s:
@@ -178,12 +183,12 @@ class Service(threading.Thread):
 
     def _serve(self) -> None:
         """Take a bounded number of messages from each door."""
-        for parcel in self._local.receive(_MESSAGES_A_ROUND):
+        for parcel in self._local.receive(MESSAGES_A_ROUND):
             waiting = Waiting(
                 self._local, parcel.identity, parcel.tag, local_sender(parcel.payload)
             )
             self._receive(waiting, bytes(parcel.payload.buffer))
-        for parcel in self._gateway.receive(_MESSAGES_A_ROUND):
+        for parcel in self._gateway.receive(MESSAGES_A_ROUND):
             self._open(parcel.identity, parcel.tag, bytes(parcel.payload.buffer))
 
     def _open(self, identity: bytes, tag: bytes, payload: bytes) -> None:

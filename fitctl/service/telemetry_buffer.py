@@ -102,8 +102,6 @@ class TelemetryBuffer:
                 self._piezo[record.loop] = record
             case LoopTiming():
                 self._timing[record.loop] = record
-            case RecorderStatus():
-                self.recorder = record
             case CommandRecord() if record.command == "Stop" and record.accepted:
                 self.stopped_by = record.sender
 

@@ -24,6 +24,7 @@ from fitctl.drivers.interface import (
     HexapodReading,
     Pose,
     ServoReading,
+    beyond_travel,
 )
 from fitctl.model.hexapod_motion import MotionLimits, Trajectory, at_rest, plan_move, plan_stop
 from fitctl.model.image.pixel_noise import pixel_normals
@@ -246,11 +247,10 @@ class SimulatedHexapod:
         """
         if not self._referenced:
             raise self._refusal("a referenced hexapod", "one that is not", "reference it first")
-        for axis, value, (low, high) in zip(Pose._fields, pose, self._ends, strict=True):
-            if not low <= value <= high:
-                raise self._refusal(
-                    f"{axis} within {low:g} to {high:g}", f"{value:g}", "choose a nearer pose"
-                )
+        for name, value, low, high in beyond_travel(pose, self._ends):
+            raise self._refusal(
+                f"{name} within {low:g} and {high:g}", f"{value:g}", "choose a nearer pose"
+            )
         velocity_mm_s = min(velocity_mm_s, self._limits.velocity_mm_s)
         self._go_to(pose, self._limits._replace(velocity_mm_s=velocity_mm_s))
 

@@ -12,7 +12,14 @@ import numpy as np
 from fitctl.clock import Clock
 from fitctl.config import Collector, CollectorMotion
 from fitctl.drivers.endpoint import Endpoint
-from fitctl.drivers.interface import DeviceError, DeviceFault, DeviceRefused, Hexapod, Pose
+from fitctl.drivers.interface import (
+    DeviceError,
+    DeviceFault,
+    DeviceRefused,
+    Hexapod,
+    Pose,
+    beyond_travel,
+)
 from fitctl.model.collector_motion import Course, Displacement, course_of
 from fitctl.model.metrology.geometry import transverse_axes
 
@@ -168,14 +175,12 @@ class CollectorDrive:
                 "slow collector.motion down",
             )
         for place in course.reach_mm:
-            pose = self._pose(origin, place)
-            for name, value, (low, high) in zip(Pose._fields, pose, self._ends, strict=True):
-                if not low <= value <= high:
-                    raise self._refused(
-                        f"a course with {name} within {low:g} and {high:g}",
-                        f"{value:.4g}",
-                        "shorten collector.motion, or move the hexapod towards zero first",
-                    )
+            for name, value, low, high in beyond_travel(self._pose(origin, place), self._ends):
+                raise self._refused(
+                    f"a course with {name} within {low:g} and {high:g}",
+                    f"{value:.4g}",
+                    "shorten collector.motion, or move the hexapod towards zero first",
+                )
 
     def _check_follows(self) -> None:
         reading = self._hexapod.pose()

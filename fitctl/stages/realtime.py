@@ -58,12 +58,12 @@ def lock_memory() -> str:
 
 
 def quiet_interpreter() -> None:
-    """Let threads change places quickly, and collect no garbage by itself: a :class:`Collector` does."""
+    """Let threads change places quickly, and collect no garbage by itself: a :class:`GarbageCollector` does."""
     gc.disable()
     sys.setswitchinterval(2e-4)
 
 
-class Collector:
+class GarbageCollector:
     """Collects garbage between ticks: every cycle among the objects that are not set aside, in 0.2 ms.
 
     Collecting among the 60 000 objects of libraries and settings would stop all threads for 20 to 40 ms. The

@@ -91,9 +91,9 @@ def clickable(line: Iterable[Segment], action: str) -> Line:
     return [Segment(part.text, (part.style or Style()) + _doing(action)) for part in line]
 
 
-def cap(key: str, label: str, action: str, *, on: str = SKY) -> Line:
+def cap(key: str, label: str, action: str) -> Line:
     """A key and what it does, for keyboard and mouse."""
-    return clickable([text(key, PAPER, on=on, bold=True), text(f" {label} ", INK)], action)
+    return clickable([text(key, PAPER, on=SKY, bold=True), text(f" {label} ", INK)], action)
 
 
 @lru_cache(maxsize=4096)

@@ -14,7 +14,7 @@ from fitctl.controllers.photodiodes import (
     PhotodiodeArray,
     ambient_of,
     capture_radius_m,
-    measured_radius_m,
+    reach_m,
 )
 from fitctl.model.metrology.photodiodes import diode_volts
 
@@ -32,7 +32,8 @@ class Settings(NamedTuple):
 
 SENSOR = Settings()
 ARRAY = PhotodiodeArray(SENSOR, SIGMA)
-MEASURED_M = measured_radius_m(SENSOR, SIGMA)
+# Within it, a beam gives light to all four diodes; the worst direction is away from one.
+MEASURED_M = reach_m(SENSOR, SIGMA) - SENSOR.diode_offset_m
 CAPTURE_M = capture_radius_m(SENSOR, SIGMA)
 DIRECTIONS = st.floats(-math.pi, math.pi)
 

@@ -9,7 +9,6 @@ from contextlib import contextmanager, suppress
 from fitctl.config import default_rig_path, load_rig
 from fitctl.messages.commands import Jog, MoveCollector, Reset, Shutdown, Stop
 from fitctl.mocks.bench import ClearFaults, SetFault
-from fitctl.model.optics import scales
 
 from .entries.commands import ALONE, BATCH, FASTER, FLOOD, FLOODED, SENT, answers
 
@@ -19,7 +18,7 @@ DRAWS_WITHIN_S = 10.0
 RECORDER_BACK_S = 60.0  # its supervisor waits longer from try to try
 RIG = load_rig(default_rig_path())
 JOG_SKY_ARCSEC = 90.0  # nearly as far as one jog goes
-JOG_RAD = JOG_SKY_ARCSEC / scales(RIG, RIG.loops["right"]).motor_sky_arcsec_per_rad
+JOG_RAD = JOG_SKY_ARCSEC / RIG.loops["right"].siderostat.sky_arcsec_per_motor_rad
 MOVED_RAD = 0.1  # of a motor
 BEGINS_S = 2.0  # a jog
 COLLECTOR_S = 10.0  # until the hexapod is referenced and moves

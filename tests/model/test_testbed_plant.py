@@ -67,7 +67,7 @@ def test_the_siderostat_that_follows_the_collector_turns_the_left_star_alone():
     metrology = plant.metrology_loops["metrology"]
     plant.advance(0.1)
     before = {loop: standing_px(plant, loop) for loop in ("left", "right")}
-    motor_rad = 1e-4 / metrology.constants.motor_sky_rad_per_rad
+    motor_rad = 1e-4 / metrology.constants.sky_rad_per_motor_rad
     turn(plant, "metrology", [motor_rad, 0.0], 1.0)
     assert metrology.offset_m(plant.time_s)[0] == pytest.approx([1e-3, 0.0], rel=1e-3)
     assert shifted(plant, before["left"], "left") == pytest.approx([7.617, 0.0], abs=0.01)

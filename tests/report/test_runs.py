@@ -67,6 +67,8 @@ def test_a_folder_is_its_newest_run(halves, rig):
         log.write(info, 1000.0)
         log.write(Event(time_s=1.0, severity="info", source="x", message="y"), 1000.0)
 
+    (halves / "damaged.mcap").write_bytes(b"no log")
+
     assert [log.path.name for log in find_run([halves]).logs] == ["a.mcap", "b.mcap"]
     with pytest.raises(LogError, match=r"older\.mcap: is of another run.*--compare"):
         find_run([halves / "a.mcap", other])

@@ -5,7 +5,7 @@ import weakref
 
 import pytest
 
-from fitctl.stages.realtime import Collector, quiet_interpreter
+from fitctl.stages.realtime import GarbageCollector, quiet_interpreter
 
 
 class Node:
@@ -19,7 +19,7 @@ class Node:
 def collector():
     """As a supervisor has it after its start; the interpreter of the tests is given back as it was."""
     quiet_interpreter()
-    yield Collector()
+    yield GarbageCollector()
     gc.unfreeze()
     gc.enable()
 

@@ -14,7 +14,6 @@ from fitctl.drivers.interface import DeviceFault
 from fitctl.logging.records import BeamPlace, StarPlace
 from fitctl.messages.commands import Acquire, Off, Standby, Stop
 from fitctl.messages.modes import Mode
-from fitctl.model.optics import scales
 from fitctl.simulation.devices import InlineExecutor
 from fitctl.simulation.simulation import Simulation
 from fitctl.supervisor.supervisor import Supervisor
@@ -32,12 +31,12 @@ def searches_elsewhere(simulation):
     darken(simulation)
     held_rad = simulation.supervisor.servos["right"].position_rad
     loop = simulation.rig.loops["right"]
-    far_rad = 120.0 / scales(simulation.rig, loop).motor_sky_arcsec_per_rad
+    far_rad = 120.0 / loop.siderostat.sky_arcsec_per_motor_rad
     while np.abs(simulation.supervisor.servos["right"].position_rad - held_rad).max() < far_rad:
         simulation.run(0.1)
         assert simulation.clock.now_s() < 200.0
     scene._flux_dn = flux_dn
-    return held_rad * scales(simulation.rig, loop).motor_sky_arcsec_per_rad
+    return held_rad * loop.siderostat.sky_arcsec_per_motor_rad
 
 
 def killed(simulation, *, recall=True):

@@ -212,7 +212,7 @@ _EXITS = {"done": 0, "failed": FAILED, "ended": FAILED, "under way": STILL_UNDER
 
 
 def send_to_all(
-    running: list[RunningRig], command: AnyCommand, sender: str, *, as_json: bool = False
+    running: list[RunningRig], command: AnyCommand, sender: str, *, as_json: bool
 ) -> int:
     """Send one command to several supervisors at once and print each reply; returns the exit status."""
     with ThreadPoolExecutor(len(running)) as threads:
@@ -239,7 +239,7 @@ def _reply(client: Client, command: AnyCommand) -> Reply | ConnectionError:
         return error
 
 
-def print_reply(reply: Reply | ConnectionError, sender: str, *, as_json: bool = False) -> int:
+def print_reply(reply: Reply | ConnectionError, sender: str, *, as_json: bool) -> int:
     """Print a reply, or why there is none; returns the exit status."""
     if isinstance(reply, ConnectionError):
         say(f"{sender}: {reply}", err=True)

@@ -71,7 +71,7 @@ def uneven_line(off: Similar) -> str:
 def star_moves(site: Site) -> str:
     """What the step moves."""
     reach = site.loop.acquisition.search_radius_sky_arcsec
-    motor = scales(site.rig, site.loop).motor_sky_arcsec_per_rad
+    motor = site.loop.siderostat.sky_arcsec_per_motor_rad
     if len(site.rig.stellar_loops) > 1:
         first = f"azimuth by {ROUGH_RAD:g} rad, to see which star it moves; if none"
     else:

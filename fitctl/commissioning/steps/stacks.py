@@ -18,6 +18,7 @@ Floats = NDArray[np.float64]
 STEP_V = 0.3
 _SETTLE_S = 0.2
 _REWRITE_S = 0.1  # a D/A's own watchdog wants writes
+_TICK_S = 0.02  # between the voltages of a slow way
 _FOLLOWS = 0.15  # relative; what the amplifier reads back is good to a few per cent of a step
 _MOVED = 0.15  # of a step; less is nothing
 _NAMES = ("stack 1", "stack 2", "stack 3")
@@ -59,12 +60,12 @@ class Stacks:
             self._clock.sleep_until(self._clock.now_s() + min(left_s, _REWRITE_S))
             self.set(self.volts)
 
-    def slew(self, volts: Floats, v_per_s: float, tick_s: float = 0.02) -> None:
+    def slew(self, volts: Floats, v_per_s: float) -> None:
         """Go there slowly."""
         while np.any(apart := volts - self.volts):
-            most_v = v_per_s * tick_s
+            most_v = v_per_s * _TICK_S
             self.set(self.volts + np.clip(apart, -most_v, most_v))
-            self._clock.sleep_until(self._clock.now_s() + tick_s)
+            self._clock.sleep_until(self._clock.now_s() + _TICK_S)
 
     def measured_v(self) -> Floats:
         """What the amplifier reads back, once it has settled."""

@@ -7,11 +7,10 @@ import math
 from collections.abc import Iterator
 
 from fitctl.config.conflict import Conflict, Part, above, at_least, at_most
-from fitctl.config.devices import HALF_WINDOW_PX
+from fitctl.config.devices import HALF_WINDOW_PX, WINDOW_PX
 from fitctl.config.loops import Loop
 from fitctl.config.rig import Rig
 
-_WINDOW_PX = 2 * HALF_WINDOW_PX + 1
 _Star = tuple[str, Loop]
 
 
@@ -28,11 +27,11 @@ def _windows(rig: Rig, one: _Star, other: _Star) -> Iterator[Conflict]:
     apart_px = max(abs(a - b) for a, b in zip(*places, strict=True))
     far, loop = max((one, other), key=lambda star: _reach_px(rig, star[1]))
     reach_px = _reach_px(rig, loop)
-    if apart_px >= _WINDOW_PX + reach_px:
+    if apart_px >= WINDOW_PX + reach_px:
         return
     first, second = (f"loops.{name}.target_px" for name, _ in (one, other))
-    demand = f"at least {_WINDOW_PX + reach_px:.2f} px from {{}}"
-    fits = max(apart_px - _WINDOW_PX, 0) / reach_px
+    demand = f"at least {WINDOW_PX + reach_px:.2f} px from {{}}"
+    fits = max(apart_px - WINDOW_PX, 0) / reach_px
     yield Conflict(
         f"the targets are {apart_px:g} px apart, and a window and the reach of a mirror must fit between them",
         (

@@ -27,12 +27,11 @@ class SlowSwing(NamedTuple):
     Attributes
     ----------
     frequency_hz : float
-    motor_half_widths, beam_half_widths : float
-        Amplitudes, in half widths of the play.
+    beam_half_widths : float
+        Amplitude of the beam, in half widths of the play.
     """
 
     frequency_hz: float
-    motor_half_widths: float
     beam_half_widths: float
 
 
@@ -86,4 +85,4 @@ def slow_swing(
     if not len(turns):
         return None
     _, omega_rad_s, amplitude, gain = found[int(turns[0])]
-    return SlowSwing(float(omega_rad_s) / (2 * math.pi), amplitude, amplitude * float(gain))
+    return SlowSwing(float(omega_rad_s) / (2 * math.pi), amplitude * float(gain))

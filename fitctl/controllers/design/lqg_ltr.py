@@ -157,7 +157,7 @@ def in_pairs(roots: Complexes) -> Complexes:
     return np.concatenate([roots[real].real, upper, upper.conj()])
 
 
-def without_fast_poles(compensator: Compensator, count: int = _REMOVED) -> Compensator:
+def without_fast_poles(compensator: Compensator) -> Compensator:
     """The fastest poles dropped, the gain at rest kept.
 
     Raises
@@ -166,9 +166,9 @@ def without_fast_poles(compensator: Compensator, count: int = _REMOVED) -> Compe
         If that would part a pair of complex poles.
     """
     order = np.argsort(np.abs(compensator.poles))
-    kept, removed = compensator.poles[order[:-count]], compensator.poles[order[-count:]]
+    kept, removed = compensator.poles[order[:-_REMOVED]], compensator.poles[order[-_REMOVED:]]
     if abs(removed.imag.sum()) > _ROUNDING * np.abs(removed).max():
-        msg = f"dropping the {count} fastest poles of the compensator would part a pair of complex ones"
+        msg = f"dropping the {_REMOVED} fastest poles of the compensator would part a pair of complex ones"
         raise ArithmeticError(msg)
     gain = compensator.gain / float(np.real(np.prod(-removed)))
     return Compensator(compensator.zeros, kept, gain, removed)

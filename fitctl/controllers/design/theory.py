@@ -67,7 +67,7 @@ def loop_theory(rig: Rig, loop_name: str, design: Design) -> LoopTheory:
         motor_px_per_rad=motor_px_per_rad,
         hysteresis_known=loop.fsm.hysteresis is not None,
         backlash_rad=_half_width_rad(
-            loop.siderostat.backlash_sky_arcsec, scale.motor_sky_arcsec_per_rad
+            loop.siderostat.backlash_sky_arcsec, loop.siderostat.sky_arcsec_per_motor_rad
         ),
         link_px_per_rad=link_px_per_rad,
         link_backlash_rad=link_backlash_rad,

@@ -20,9 +20,9 @@ from fitctl.drivers.interface import (
     DeviceMismatch,
     DeviceRefused,
     DeviceTimeout,
-    DeviceUnreachable,
     HexapodReading,
     Pose,
+    beyond_travel,
 )
 from fitctl.drivers.probe import Probe, round_trip_s
 
@@ -252,13 +252,10 @@ class C887Hexapod:
 
     def _check_move(self, pose: Pose, velocity_mm_s: float) -> None:
         hint = "correct the motion, or collector.hexapod in the rig file"
-        for name, value, (low, high) in zip(
-            Pose._fields, pose, self._device.travel.ends, strict=True
-        ):
-            if not low <= value <= high:
-                raise self._endpoint.error(
-                    DeviceRefused, f"{name} within {low:g} and {high:g}", f"{value:g}", hint
-                )
+        for name, value, low, high in beyond_travel(pose, self._device.travel.ends):
+            raise self._endpoint.error(
+                DeviceRefused, f"{name} within {low:g} and {high:g}", f"{value:g}", hint
+            )
         most = self._device.velocity_limit_mm_s
         if not 0 < velocity_mm_s <= most:
             raise self._endpoint.error(
@@ -283,9 +280,7 @@ class C887Hexapod:
 
     def _opened(self) -> C887Link:
         if self._link is None:
-            raise self._endpoint.error(
-                DeviceUnreachable, "an open connection", "none", "open it again"
-            )
+            raise self._endpoint.not_open()
         return self._link
 
     def _mismatch(self, expected: str, got: str, where: str) -> None:

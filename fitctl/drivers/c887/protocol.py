@@ -18,7 +18,6 @@ from enum import IntEnum
 from typing import NamedTuple
 
 AXES = ("X", "Y", "Z", "U", "V", "W")
-TCP_PORT = 50000
 LF = b"\n"
 ANSWER_BYTES_MAX = 65536  # HLP? of the largest controllers is a few kB
 DECIMALS = 6  # of a target: a nanometre, a microdegree

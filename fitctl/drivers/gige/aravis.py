@@ -259,9 +259,7 @@ class AravisCamera:
 
     def _opened(self) -> Heartbeat:
         if self._device is None or self._heartbeat is None:
-            raise self._endpoint.error(
-                DeviceUnreachable, "an open camera", "a closed one", "open() it"
-            )
+            raise self._endpoint.not_open()
         return self._heartbeat
 
     @contextlib.contextmanager

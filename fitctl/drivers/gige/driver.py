@@ -28,7 +28,6 @@ from fitctl.drivers.interface import (
     DeviceIdentity,
     DeviceMismatch,
     DeviceRefused,
-    DeviceUnreachable,
     Frame,
 )
 
@@ -201,8 +200,7 @@ class GigeCamera:
 
     def _opened(self) -> tuple[ControlChannel, Features, Heartbeat]:
         if self._channel is None or self._features is None or self._heartbeat is None:
-            endpoint = Endpoint(DEVICE, self._camera.device.endpoint)
-            raise endpoint.error(DeviceUnreachable, "an open camera", "a closed one", "open() it")
+            raise Endpoint(DEVICE, self._camera.device.endpoint).not_open()
         return self._channel, self._features, self._heartbeat
 
 

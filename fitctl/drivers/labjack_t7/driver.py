@@ -13,7 +13,6 @@ from fitctl.drivers.interface import (
     DeviceError,
     DeviceIdentity,
     DeviceMismatch,
-    DeviceUnreachable,
     DiodeReading,
 )
 from fitctl.drivers.labjack_t7 import protocol
@@ -179,9 +178,7 @@ class LabJackT7:
 
     def _opened(self) -> T7Link:
         if self._link is None:
-            raise self._endpoint.error(
-                DeviceUnreachable, "an open connection", "none", "open it again"
-            )
+            raise self._endpoint.not_open()
         return self._link
 
 

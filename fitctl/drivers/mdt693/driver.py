@@ -282,7 +282,7 @@ class Mdt693:
 
     def _opened(self) -> serial.Serial:
         if self._port is None:
-            raise self._endpoint.error(DeviceUnreachable, "an open port", "none", "open it again")
+            raise self._endpoint.not_open()
         return self._port
 
     def _broken(self, expected: str, error: OSError) -> NoReturn:

@@ -20,6 +20,7 @@ from fitctl.config import ARCSEC_PER_RAD, AirPathModel, MetrologyLoop, Rig
 from fitctl.identify.backlash import behind_play
 from fitctl.identify.drawing import new_figure
 from fitctl.identify.errors import IdentifyError
+from fitctl.identify.link.ambient import DIODES
 from fitctl.identify.record import axis_pair
 from fitctl.identify.slow_mean import correlation
 from fitctl.logging.reading import Columns
@@ -29,7 +30,6 @@ from fitctl.model.optics import rotation
 Floats = NDArray[np.float64]
 STEP = "beam_scan"
 Kind = TypeVar("Kind", bound="BeamResult")
-DIODES = ("az+", "az-", "el+", "el-")
 _LEAST_SAMPLES = 1000
 _LEAST_SWING_M = 0.5  # of the beam's radius, along each axis
 _MOST_EXCESS = 5.0

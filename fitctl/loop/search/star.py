@@ -188,7 +188,7 @@ def _too_fast(rig: Rig, loop_name: str, asked: Acquire) -> str:
     motor_rad_s = np.abs(sky_rad_s(AxisPair.model_construct(az=az, el=el), scale)).max()
     # Written so that what is no number is refused too.
     if not motor_rad_s <= loop.siderostat.velocity_limit_rad_s:
-        most = loop.siderostat.velocity_limit_rad_s * scale.motor_sky_arcsec_per_rad
+        most = loop.siderostat.velocity_limit_rad_s * loop.siderostat.sky_arcsec_per_motor_rad
         return (
             f"the siderostat cannot follow a star at az {az:g}, el {el:g} arcsec/s; velocity_limit_rad_s of "
             f"loops.{loop_name}.siderostat is {most:.0f} arcsec/s for a motor"

@@ -61,7 +61,7 @@ class Acquisition:
 
     Attributes
     ----------
-    frames_sent, late_frames : int
+    late_frames : int
         Frames, and how many left more than 2 ms after their time.
     worst_late_s : float
         By how much the latest one was late.
@@ -78,7 +78,6 @@ class Acquisition:
         true_rate_hz: float | None = None,
     ) -> None:
         self._true_rate_hz = true_rate_hz
-        self.frames_sent = 0
         self.late_frames = 0
         self.worst_late_s = 0.0
         self._render = render
@@ -200,4 +199,3 @@ class Acquisition:
         self.worst_late_s = max(self.worst_late_s, late_s)
         self.late_frames += late_s > LATE_S
         self._stream.send_frame(frame.block_id, frame.packets)
-        self.frames_sent += 1

@@ -39,7 +39,7 @@ BEAM_CONSTANTS = np.dtype(
         ("amplifier_decay", "f8"),
         ("amplifier_lag_s", "f8"),
         ("backlash_half_rad", "f8"),
-        ("motor_sky_rad_per_rad", "f8"),
+        ("sky_rad_per_motor_rad", "f8"),
         ("turn", "f8", (2, 2)),
     ]
 )
@@ -53,7 +53,7 @@ class BeamConstants(NamedTuple):
     amplifier_decay: float
     amplifier_lag_s: float
     backlash_half_rad: float
-    motor_sky_rad_per_rad: float
+    sky_rad_per_motor_rad: float
     turn: Floats
     air: AirConstants
 
@@ -78,7 +78,7 @@ def beam_constants(rig: Rig, loop_name: str) -> BeamConstants:
         amplifier_decay=float(np.exp(-truth.step_s / lag_s)),
         amplifier_lag_s=lag_s,
         backlash_half_rad=plant.backlash_sky_arcsec / ARCSEC_PER_RAD / motor_sky / 2,
-        motor_sky_rad_per_rad=motor_sky,
+        sky_rad_per_motor_rad=motor_sky,
         turn=rotation(siderostat.rotation_deg),
         air=air_constants(_filter(plant.air_path), truth.step_s),
     )
@@ -133,7 +133,7 @@ def turn_beam(constants: Any, state: Any, misaligned_rad: Floats, beam_rad: Floa
             beam = s.beam_motor_rad[axis]
             for row in range(beam_rad.shape[0]):
                 motor, lead, beam = step_motor(motor, lead, beam, moved, catch_up_s, decay, half)
-                beam_rad[row, run, axis] = c.motor_sky_rad_per_rad * beam
+                beam_rad[row, run, axis] = c.sky_rad_per_motor_rad * beam
             s.motor_rad[axis], s.motor_rad_s[axis] = motor, command + lead
             s.beam_motor_rad[axis] = beam
         for row in range(beam_rad.shape[0]):

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import ARCSEC_PER_RAD, HALF_WINDOW_PX, Camera, Loop, Rig
+from fitctl.config import ARCSEC_PER_RAD, WINDOW_PX, Camera, Loop, Rig
 from fitctl.config.loops import OtherSpot
 from fitctl.controllers.centroid import OtherLight, StarSensor
 from fitctl.controllers.visibility import mean_visibility, visibility
@@ -24,12 +24,12 @@ from fitctl.messages.modes import Mode
 from fitctl.model.optics import scales
 from fitctl.sequences import steps
 from fitctl.sequences.behaviours.behaviour import Behaviour, Calibration, Result, too_far
+from fitctl.sequences.behaviours.pointing import stop_visit
 from fitctl.sequences.view import Figures, StepFailed, View
 
 Floats = NDArray[np.float64]
 AzElPx = tuple[float, float]
 FRINGE = "fringe"  # of a loop's other_spots
-_WINDOW_PX = 2 * HALF_WINDOW_PX + 1
 _PLACES = 5  # aside and aside, the same about what was found, and there
 _LEAST_MEASURED = 0.5  # of the frames that telemetry has
 _MOST_LEFT = 4.0  # standard deviations
@@ -124,7 +124,7 @@ def _has_room(rig: Rig, pair: Pair, aside_px: Floats) -> bool:
         for place in (_target_px(loop), _target_px(loop) + _fringe_offset_px(loop))
     ]
     return all(rig.camera.window_fits(*place) for place in places) and all(
-        np.abs(one - another).max() >= _WINDOW_PX
+        np.abs(one - another).max() >= WINDOW_PX
         for one, another in itertools.combinations(places, 2)
     )
 
@@ -150,7 +150,7 @@ def _check(step: steps.Overlap, rig: Rig, loop_name: str) -> list[str]:
     if direction_of(step, rig, loop_name) is None:
         problems.append(
             f"no room to step aside by {step.separation_px:g} px: both stars and both fringe spots must be on "
-            f"the frame, {_WINDOW_PX} px apart; move the targets or lower separation_px"
+            f"the frame, {WINDOW_PX} px apart; move the targets or lower separation_px"
         )
     if step.steady_after_s >= step.dwell_s:
         problems.append(f"steady_after_s must be below dwell_s, {step.dwell_s:g} s")
@@ -346,9 +346,4 @@ def _length(values: Floats) -> float:
     return math.hypot(*values.tolist())
 
 
-def _stop(_step: steps.Overlap, view: View) -> None:
-    target = view.settings.target_px
-    view.ask(SetTarget(loop=view.loop_name, az_px=target.az, el_px=target.el))
-
-
-OVERLAP = {"overlap": Behaviour(frozenset({Mode.VERNIER}), _done, _run, _stop, _check, _own_s)}
+OVERLAP = {"overlap": Behaviour(frozenset({Mode.VERNIER}), _done, _run, stop_visit, _check, _own_s)}

@@ -208,12 +208,13 @@ def _evaluate_visits(step: steps.Visiting, view: View, offsets: list[Offset]) ->
     return Result(figures, f"settled in {figures['settled_s']:.1f} s; {held.message}")
 
 
-def _stop_visit(_step: steps.Visiting, view: View) -> None:
+def stop_visit(_step: steps.Step, view: View) -> None:
+    """Send the star back to the rig file's target."""
     target = view.settings.target_px
     view.ask(SetTarget(loop=view.loop_name, az_px=target.az, el_px=target.el))
 
 
-_VISIT = Behaviour(_NEEDS, _visit_done, _run_visit, _stop_visit, _check_visit, _visit_s)
+_VISIT = Behaviour(_NEEDS, _visit_done, _run_visit, stop_visit, _check_visit, _visit_s)
 POINTING = {
     "hold": Behaviour(
         HOLDING, _hold_done, check=_check_hold, own_s=_hold_s, pausable=True, of_beams=True

@@ -193,8 +193,8 @@ def turn_by(b: Any, r: Any, az_rad: float, el_rad: float) -> None:
     siderostat_to(
         b,
         r,
-        r.setpoint_rad[0] + az_rad / b.motor_sky_rad_per_rad,
-        r.setpoint_rad[1] + el_rad / b.motor_sky_rad_per_rad,
+        r.setpoint_rad[0] + az_rad / b.sky_rad_per_motor_rad,
+        r.setpoint_rad[1] + el_rad / b.sky_rad_per_motor_rad,
     )
 
 

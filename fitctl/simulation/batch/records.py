@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import HALF_WINDOW_PX
+from fitctl.config import WINDOW_PX
 from fitctl.config.devices import MOST_WRITES
 from fitctl.config.plant import MOST_INSTANTS
 from fitctl.controllers.attribution import MOST_STRANGERS
@@ -27,7 +27,7 @@ DONE, FOLLOWING_ERROR, NOT_FOUND, REFUSED_COURSE = (
 MOST_SPOTS, MOST_PLAYS, MOST_STATES, MOST_HISTORY = 8, 32, 33, 1024
 MOST_LINES, MOST_EPOCHS = 8, 64
 MOST_REQUESTS = 64  # of the photodiodes, under way at one time
-RING_STEPS, BLOCK_NODES, SIDE_PX = 1024, 8, 2 * HALF_WINDOW_PX + 1
+RING_STEPS, BLOCK_NODES = 1024, 8
 
 
 def _numbers(*names: str) -> list[tuple[str, str]]:
@@ -188,9 +188,9 @@ STAR_WORK = np.dtype(
         ("trace_px", "f8", (RING_STEPS, 2)),
         ("piston_m", "f8", (RING_STEPS,)),
         ("spots_px", "f8", (MOST_INSTANTS * MOST_SPOTS, 2)),
-        ("window_dn", "f8", (SIDE_PX, SIDE_PX)),
-        ("down", "f8", (SIDE_PX,)),
-        ("across", "f8", (SIDE_PX,)),
+        ("window_dn", "f8", (WINDOW_PX, WINDOW_PX)),
+        ("down", "f8", (WINDOW_PX,)),
+        ("across", "f8", (WINDOW_PX,)),
     ]
 )
 BEAM_WORK = np.dtype(
@@ -271,7 +271,7 @@ BEAM_SETTINGS = np.dtype(
         ("spiral", _numbers("growth_px", "speed_px_s", "acceleration_px_s2", "pitch_px")),
         *_numbers("search_radius_px", "search_again_pause_s", "search_again_s"),
         ("hold", _numbers("gain_per_s", "second_per_s")),
-        *_numbers("pull_in_rad_s", "hold_most_rad", "motor_sky_rad_per_rad"),
+        *_numbers("pull_in_rad_s", "hold_most_rad", "sky_rad_per_motor_rad"),
         ("turn", "f8", (2, 2)),
         (
             "servo",

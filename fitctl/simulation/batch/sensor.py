@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import HALF_WINDOW_PX
+from fitctl.config import HALF_WINDOW_PX, WINDOW_PX
 from fitctl.controllers.attribution import FOLLOWED_PX, MOST_STRANGERS, PROVEN_PX, is_within
 from fitctl.controllers.centroid import (
     EDGE_PX,
@@ -23,7 +23,6 @@ from fitctl.model.image.light import REACH_SIGMAS, light_fractions
 from fitctl.model.image.scene import render
 from fitctl.simulation.batch.laws import ACQUISITION, COARSE, NOT_DUE, VERNIER, has_arrived
 from fitctl.simulation.batch.mirror import mirror_px
-from fitctl.simulation.batch.records import SIDE_PX
 from fitctl.simulation.batch.siderostat import motor_px
 
 Floats = NDArray[np.float64]
@@ -47,12 +46,12 @@ def centroid(
     All nan where there is no light, or one pixel has most of it.
     """
     top, left = window_el - HALF_WINDOW_PX - first_row, window_az - HALF_WINDOW_PX - first_column
-    window_dn = light_dn[top : top + SIDE_PX, left : left + SIDE_PX]
+    window_dn = light_dn[top : top + WINDOW_PX, left : left + WINDOW_PX]
     flux = az_moment = el_moment = peak = 0.0
-    for row in range(SIDE_PX):
+    for row in range(WINDOW_PX):
         # A sum of its own for each row: one long sum would wait for itself.
         row_dn = row_moment = 0.0
-        for column in range(SIDE_PX):
+        for column in range(WINDOW_PX):
             dn = window_dn[row, column] - s.bias_dn
             peak = max(peak, dn)
             row_dn += dn
@@ -74,8 +73,8 @@ def fitted(s: Any, window_dn: Floats, az_px: float, el_px: float) -> tuple[float
     for _ in range(2):
         row, column = node(el_px), node(az_px)
         light = az_moment = el_moment = 0.0
-        for pixel in range(SIDE_PX * SIDE_PX):
-            dn = window_dn[pixel // SIDE_PX, pixel % SIDE_PX] - s.bias_dn
+        for pixel in range(WINDOW_PX * WINDOW_PX):
+            dn = window_dn[pixel // WINDOW_PX, pixel % WINDOW_PX] - s.bias_dn
             light += s.fit_weights[row, column, 0, pixel] * dn
             az_moment += s.fit_weights[row, column, 1, pixel] * dn
             el_moment += s.fit_weights[row, column, 2, pixel] * dn
@@ -130,7 +129,7 @@ def subtract_others(ss: Any, rr: Any, w: Any, i: int, window_az: int, window_el:
             az_px = star_az_px + s.followed_offset_px[spot, 0]
             el_px = star_el_px + s.followed_offset_px[spot, 1]
             away_px = max(abs(az_px - window_az), abs(el_px - window_el))
-            if away_px >= SIDE_PX / 2 + REACH_DIAMETERS * 4 * s.followed_sigma_px:
+            if away_px >= WINDOW_PX / 2 + REACH_DIAMETERS * 4 * s.followed_sigma_px:
                 continue
             left, right = light_fractions(
                 first_column, az_px, s.followed_sigma_px, s.light, w.across
@@ -177,8 +176,8 @@ def centroid_on(
     """:func:`centroid` about a window of a whole frame, without other loops' light."""
     w = ww.stars[i]
     first_row, first_column = window_el - HALF_WINDOW_PX, window_az - HALF_WINDOW_PX
-    for row in range(SIDE_PX):
-        for column in range(SIDE_PX):
+    for row in range(WINDOW_PX):
+        for column in range(WINDOW_PX):
             w.window_dn[row, column] = frame_dn[first_row + row, first_column + column]
     subtract_others(ss, rr, w, i, window_az, window_el)
     return centroid(ss.stars[i], w.window_dn, first_row, first_column, window_az, window_el)
@@ -295,7 +294,7 @@ def sense(ss: Any, rr: Any, ww: Any, i: int) -> int:
         az = window_centre(r.star_origin_px[0] + az_px, s.sensor.largest_az_px)
         el = window_centre(r.star_origin_px[1] + el_px, s.sensor.largest_el_px)
         left, top = az - HALF_WINDOW_PX, el - HALF_WINDOW_PX
-        lit = spots_over(ss, rr, ww, w.spots_px, left, top, SIDE_PX, SIDE_PX)
+        lit = spots_over(ss, rr, ww, w.spots_px, left, top, WINDOW_PX, WINDOW_PX)
         if lit < 0:
             return lit
         if measure(ss, rr, ww, i, az, el):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fitctl.config import ARCSEC_PER_RAD, Rig
+from fitctl.config import ARCSEC_PER_RAD, WINDOW_PX, Rig
 from fitctl.config.devices import MOST_WRITES
 from fitctl.config.plant import MOST_INSTANTS
 from fitctl.controllers.attribution import look_places_px
@@ -51,7 +51,6 @@ from fitctl.simulation.batch.records import (
     MOST_STATES,
     NOISE,
     RING_STEPS,
-    SIDE_PX,
     filled,
 )
 from fitctl.simulation.devices import DIODE_BITS
@@ -62,7 +61,6 @@ from fitctl.stages.servo import FOLLOWING_S, HISTORY_S
 from fitctl.supervisor.starlight import noise_ratio
 
 Floats = NDArray[np.float64]
-_NO_FIT = np.zeros((PLACES, PLACES, 3, SIDE_PX**2))
 _MOST_NOISE_RATIO = 0.98 * MOST_NOISE_RATIO  # beyond it, a loop may design for the measured light
 _OWN_SIGMAS = 10.0  # a spot is never farther than this from where it should be beside the first
 
@@ -159,7 +157,7 @@ def star_settings(
                 "largest_el_px",
             ),
             "fits": sensor.fit is not None,
-            "fit_weights": np.zeros((PLACES, PLACES, 3, SIDE_PX**2))
+            "fit_weights": np.zeros((PLACES, PLACES, 3, WINDOW_PX**2))
             if sensor.fit is None
             else sensor.fit.weights[:, :, :3],
             "acquisition": _fields(
@@ -280,7 +278,7 @@ def beam_settings(
             "pull_in_rad_s": PULL_IN * loop.siderostat.velocity_limit_rad_s * motor_sky,
             "hold_most_rad": hold_most_rad(loop),
             "turn": constants.turn,
-            "motor_sky_rad_per_rad": motor_sky,
+            "sky_rad_per_motor_rad": motor_sky,
             **_siderostat(rig, loop_name),
         },
     )

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import HALF_WINDOW_PX
+from fitctl.config import WINDOW_PX
 from fitctl.logging.records import Tick
 from fitctl.text import plain
 from fitctl.tui.draw.frame import Mark, Marks, Placing, box_marks, reticle_marks
@@ -17,7 +17,6 @@ from fitctl.tui.inks import DIM, FAINT, GREEN, PINK, SKY, WHITE, YELLOW
 
 Polyline = NDArray[np.float64]
 
-WINDOW_PX = 2 * HALF_WINDOW_PX + 1
 """Side of the centroid's window; a tick names its central pixel."""
 OTHER_SPOT = "◦"
 _LIGHT_PX = 4.0  # from a spot's middle to where its light ends

@@ -11,6 +11,7 @@ from textual.events import Click
 from textual.message import Message
 from textual.strip import Strip
 
+from fitctl.config import WINDOW_PX
 from fitctl.logging.records import FrameRecord, MetrologyTick, Tick
 from fitctl.tui.draw.colours import ANCHORS, LEVELS, colour_map
 from fitctl.tui.draw.frame import (
@@ -24,7 +25,6 @@ from fitctl.tui.draw.frame import (
 from fitctl.tui.draw.overlays import (
     OTHER_SPOT,
     OVERLAY_INKS,
-    WINDOW_PX,
     Overlay,
     cell_marks,
     name_marks,

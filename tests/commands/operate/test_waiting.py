@@ -6,41 +6,17 @@ import threading
 from functools import partial
 
 import pytest
-from instruments.served import Served, until
+from instruments.served import until
 from instruments.simulated import darken, failing
 
-from fitctl.cli import main
 from fitctl.commands.operate import send
 from fitctl.commands.shared import supervisor as addressing
-from fitctl.config import default_rig_path
 from fitctl.drivers.interface import DeviceTimeout
 from fitctl.messages.commands import Acquire, Standby, Stop
 from fitctl.messages.modes import Mode
 
 WIDE = "search_radius_sky_arcsec=1100"  # a search that goes on for minutes
 SILENT = DeviceTimeout("piezo right", "/dev/ttyUSB0", "an answer in 1 s", "none", "is it on?")
-
-
-@pytest.fixture
-def served(tmp_path):
-    supervisor = Served(tmp_path)
-    supervisor.start()
-    yield supervisor
-    supervisor.close()
-
-
-@pytest.fixture
-def fitctl(served, capsys):
-    """Exit status, output and error output of a command to it."""
-
-    def run(*arguments):
-        at = ["--rig", str(default_rig_path()), "--set", f"service.folder={served.folder}"]
-        with pytest.raises(SystemExit) as end:
-            main([*arguments, *at])
-        printed = capsys.readouterr()
-        return end.value.code, printed.out, printed.err
-
-    return run
 
 
 @pytest.fixture

@@ -173,7 +173,7 @@ def test_closing_twice_is_safe_and_a_closed_driver_says_so(bench, amplifiers):
     amplifiers.close()
     amplifiers.close()
     assert bench.motors.enabled == [False, False]
-    with pytest.raises(DeviceUnreachable, match="open it first"):
+    with pytest.raises(DeviceUnreachable, match="open it again"):
         amplifiers.exchange(STILL)
 
 

@@ -18,7 +18,6 @@ from fitctl.mocks.gige.stream import StreamSettings, frame_packets
 MONO16 = protocol.PIXEL_FORMATS["Mono16"]
 SETTINGS = StreamSettings(("127.0.0.1", 1), 576, 0.0, MONO16, 40, 30, 0, 0)
 IMAGE = np.arange(1200, dtype=np.uint16).reshape(30, 40)
-PACKETS = 7  # leader, five of pixels, trailer
 
 
 class Receiver:

@@ -57,7 +57,7 @@ def test_a_star_far_away_is_found_where_it_is_expected(aside):
     assert reply.accepted
     run_until(simulation, Mode.VERNIER, 30.0)
     motor_rad = np.array(simulation.supervisor.loops["right"].servo.position_rad)
-    sky = motor_rad * scales(RIG, RIG.loops["right"]).motor_sky_arcsec_per_rad
+    sky = motor_rad * RIG.loops["right"].siderostat.sky_arcsec_per_motor_rad
     assert -sky == pytest.approx(np.add(FAR, aside), abs=2.0)
 
 
