@@ -106,6 +106,11 @@ def supervisor_runs(folder: Path) -> bool:
     return supervisor_name(folder) in names_held(supervisor_names())
 
 
+def running_rig(folder: Path) -> RunningRig | None:
+    """The supervisor of this user that runs with its sockets in this folder; None if none does."""
+    return _read(folder) if supervisor_runs(folder) else None
+
+
 def _read(folder: Path) -> RunningRig | None:
     """What runs in a folder; None if the folder is not ours, or what was left there is of a dead process."""
     try:

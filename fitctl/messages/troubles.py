@@ -98,7 +98,8 @@ def troubles(telemetry: Telemetry) -> list[Trouble]:
         # What a device reported before the last change of mode is of the past.
         is_now = device.state == "fault" and device.time_s >= changed_s
         if is_now and not any(_is_of(device, cause) for cause in found):
-            found[device.device] = _of_device(telemetry, device)
+            trouble = _of_device(telemetry, device)
+            found[trouble.key] = trouble
     return [*found.values(), *_of_recording(telemetry)]
 
 
@@ -271,10 +272,12 @@ def _of_device(telemetry: Telemetry, device: DeviceHealth) -> Trouble:
     what, todo = _parted(device.detail)
     loops = [loop.mode for loop in telemetry.loops if device.device.startswith(loop.name)]
     is_safe = Mode.SAFE.name in (loops or [loop.mode for loop in telemetry.loops])
+    # An error that names its device has the same cause when the loop goes to SAFE a message later.
+    named = f" at {device.endpoint}: " in what
     return Trouble(
-        device.device,
+        _cause(what) if named else device.device,
         "error",
-        f"{device.device} at {device.endpoint}: {what}",
+        what if named else f"{device.device} at {device.endpoint}: {what}",
         device.time_s,
         "the loop is in SAFE" if is_safe else "fitctl tries again",
         _then(todo, "recover") if is_safe else todo,

@@ -123,6 +123,23 @@ def test_a_fault_is_told_once_though_loop_and_device_both_tell_it():
     assert alarm.todo == "remove its cause, then recover"
 
 
+def test_a_fault_that_the_device_tells_a_message_before_its_loop_is_one_alarm():
+    watch = Watch(FakeSupervisor())
+    watch.supervisor.faulty = {"right siderostat": FAULT}
+    (alarm,) = watch.hear()
+    assert alarm.what == FAULT.partition(";")[0]
+    watch.supervisor.mode, watch.supervisor.trigger, watch.supervisor.reason = (
+        "SAFE",
+        "FAULT",
+        FAULT,
+    )
+
+    (alarm,) = watch.hear()
+
+    assert alarm.did == "right went to SAFE"
+    assert watch.bells == 1
+
+
 def test_what_a_device_told_before_the_recovery_is_no_new_alarm():
     watch = Watch(failed())
     watch.hear()

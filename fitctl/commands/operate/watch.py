@@ -85,11 +85,15 @@ def watch(
 ) -> None:
     """Print a line a second, and every event."""
     client = connect("watch", rig, overrides, remote)
+
+    def why_silent() -> str:  # for a remote client, asking takes a second
+        return _SILENCE if client.folder is None else client.why_silent(_LINE_S)
+
     text = to_json if as_json else _text
     received = False
     try:
         with ended_by_signals(interrupt):
-            for entry in entries(client.receive, duration):
+            for entry in entries(client.receive, duration, why_silent):
                 received = received or not isinstance(entry, Silence)
                 say(text(entry))
     except KeyboardInterrupt:
@@ -103,7 +107,9 @@ def watch(
 
 
 def entries(
-    receive: Callable[[float], Telemetry | None], duration_s: float | None
+    receive: Callable[[float], Telemetry | None],
+    duration_s: float | None,
+    why_silent: Callable[[], str] = lambda: _SILENCE,
 ) -> Iterator[Entry]:
     """What `receive` brings, a second at a time, and every event as it comes; silence once a second.
 
@@ -113,13 +119,15 @@ def entries(
         Waits at most so many seconds for the next message; ConnectionError for one that cannot be read.
     duration_s : float or None
         By this machine's clock; None goes on for ever.
+    why_silent : callable
+        Says why nothing comes.
     """
     begun_s = quiet_since_s = time.monotonic()
     due_s = math.inf
     tallies: dict[str, Tally] = {}
     newest: Telemetry | None = None
     while duration_s is None or time.monotonic() - begun_s < duration_s:
-        why = _SILENCE
+        why = ""
         try:
             telemetry = receive(_POLL_S)
         except ConnectionError as error:
@@ -128,7 +136,7 @@ def entries(
             if time.monotonic() - quiet_since_s >= _LINE_S:
                 quiet_since_s = time.monotonic()
                 stamp = datetime.now(UTC).isoformat(timespec="milliseconds")
-                yield Silence(time=stamp, message=why)
+                yield Silence(time=stamp, message=why or why_silent())
             continue
         quiet_since_s = time.monotonic()
         for event in telemetry.events:
