@@ -19,7 +19,7 @@ from mcap.records import Channel, Schema
 from mcap.writer import MCAP0_MAGIC
 
 from fitctl.files import open_regular
-from fitctl.logging.errors import LogError
+from fitctl.logging.errors import LogError, NoLogError
 
 # What a torn or damaged file makes the reader, its decompressors (lz4: RuntimeError) and protobuf (a schema
 # that is none: TypeError) raise.
@@ -113,7 +113,7 @@ def opened(path: Path) -> Iterator[tuple[IO[bytes], bool]]:
     with stream:
         if stream.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
             msg = f"{path}: is not an MCAP log; name a file that fitctl recorded"
-            raise LogError(msg)
+            raise NoLogError(msg)
         start = stream.tell()
         stream.seek(max(start, os.fstat(stream.fileno()).st_size - len(MCAP0_MAGIC)))
         finished = stream.read() == MCAP0_MAGIC

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from fitctl.config import CONTROLLERS, Rig, is_name, rig_from_log
 from fitctl.logging.errors import LogError
-from fitctl.logging.listing import newest_run, run_of
+from fitctl.logging.listing import find_newest, run_of
 from fitctl.logging.reading import LogInfo, logs_of_one_run_each
 from fitctl.logging.schemas import designs_of
 
@@ -24,12 +24,15 @@ class Run(NamedTuple):
         As it was in force.
     start_ns, end_ns : int
         UTC of the first and the last record, nanoseconds since 1970; 0 without records.
+    unreadable : tuple of str
+        What is wrong with each file that cannot be read in the folder of which this is the newest run.
     """
 
     logs: tuple[LogInfo, ...]
     rig: Rig
     start_ns: int
     end_ns: int
+    unreadable: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -62,12 +65,15 @@ def find_run(paths: Sequence[Path], rig: Rig | None = None, overrides: Sequence[
     Raises
     ------
     LogError
-        If there is no log, one cannot be read or is none of fitctl's, or they are of several runs.
+        If there is no log, one cannot be read or is none of fitctl's, they are of several runs, or the newest
+        run of the folder may be in a log that cannot be read.
     ConfigError
         If the rig in the log is none that this fitctl understands.
     """
+    unreadable: tuple[str, ...] = ()
     if len(paths) == 1 and paths[0].is_dir():
-        folder, paths = paths[0], newest_run(paths[0])
+        folder = paths[0]
+        paths, unreadable = find_newest(folder)
         if not paths:
             msg = f"{folder}: holds no log of fitctl (*.mcap); name a file, or the rig's logging.folder"
             raise LogError(msg)
@@ -86,6 +92,7 @@ def find_run(paths: Sequence[Path], rig: Rig | None = None, overrides: Sequence[
         rig=rig or _rig_of(logs[-1], overrides),
         start_ns=round(logs[0].start_s * 1e9) if with_records else 0,
         end_ns=round(max(log.end_s for log in logs) * 1e9) if with_records else 0,
+        unreadable=unreadable,
     )
 
 

@@ -75,8 +75,8 @@ def list_(rig: RigOption = None, overrides: SetOption = None, as_json: JsonOptio
             span = f"{begin}  {log.duration_s:9.1f} s" if log.counts else "without any record"
             size = f"{log.path.stat().st_size / 1e6:9.1f} MB"
             say(f"{log.path}  {span:<36}  {size}  {rig_name(log)}, {_state(log.path, log)}")
-    for problem in problems:
-        say(problem, err=True)
+    for problem in problems.values():
+        say(str(problem), err=True)
     raise typer.Exit(FAILED if problems else 0)
 
 

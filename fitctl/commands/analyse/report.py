@@ -10,7 +10,7 @@ import msgspec
 import typer
 
 from fitctl.commands.shared.exits import FAILED
-from fitctl.commands.shared.logs import LatestOption, chosen_logs
+from fitctl.commands.shared.logs import LatestOption, chosen_logs, say_unreadable
 from fitctl.commands.shared.printing import say, to_json
 from fitctl.commands.shared.rig import rig_of
 from fitctl.config import ConfigError
@@ -67,6 +67,7 @@ def report(
         msg = f"report: --compare takes 2 to {MOST_NIGHTS} logs or folders, got {len(logs)}"
         raise ConfigError(msg)
     runs = [find_run([log], settings) for log in logs] if compare else [find_run(logs, settings)]
+    say_unreadable(problem for run in runs for problem in run.unreadable)
     nights = [find(run) for run in runs]
     name = "comparison" if compare else f"{runs[0].name}_report"
     first = runs[0].logs[0].path

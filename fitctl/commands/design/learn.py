@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from fitctl.commands.shared.logs import say_unreadable
 from fitctl.commands.shared.opened import opened_loop
 from fitctl.commands.shared.printing import say_lines, to_json
 from fitctl.commands.shared.rig import require_loop, rig_of
@@ -34,6 +35,7 @@ def learn(
         If the log cannot be read.
     """
     run = find_run(logs, rig_of(rig, overrides) if rig else None, overrides or ())
+    say_unreadable(run.unreadable)
     require_loop("design learn", run.rig, loop)
     with solving("design learn", loop):
         found = _advice(run, loop)

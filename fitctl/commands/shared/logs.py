@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from fitctl.commands.shared.printing import say
 from fitctl.commands.shared.rig import rig_of
 from fitctl.commands.shared.supervisor import address_or_shipped
 from fitctl.config import ConfigError, Rig
-from fitctl.logging.listing import newest_run
+from fitctl.logging.listing import find_newest
 
 LatestOption = Annotated[
     bool, typer.Option("--latest", help="Use the newest log of the rig, in place of LOG.")
@@ -29,10 +30,14 @@ def chosen_logs(
 ) -> list[Path]:
     """The logs that a command line names, or with ``--latest`` all files of the newest run of the rig.
 
+    What cannot be read in the rig's folder of logs is named on the error output.
+
     Raises
     ------
     ConfigError
         If there are both, or neither, or the rig has no log.
+    LogError
+        If the newest run may be in a log that cannot be read.
     """
     if logs and latest:
         msg = f"{command}: --latest chooses the log; leave out --latest, or {logs[0]}"
@@ -44,14 +49,21 @@ def chosen_logs(
         raise ConfigError(msg)
     settings = logging_rig(command, rig)
     folder = Path(settings.logging.folder)
-    newest = newest_run(folder, settings.name)
-    if not newest:
+    newest = find_newest(folder, settings.name)
+    say_unreadable(newest.unreadable)
+    if not newest.files:
         msg = (
             f"{command}: --latest: {folder} has no log of rig {settings.name}; name a LOG, or another rig "
             "with --rig"
         )
         raise ConfigError(msg)
-    return newest
+    return newest.files
+
+
+def say_unreadable(problems: Iterable[str]) -> None:
+    """Name the files that could not be read where the newest run was chosen, a line each."""
+    for problem in problems:
+        say(problem, err=True)
 
 
 def chosen_log(command: str, log: Path | None, rig: Path | None, *, latest: bool) -> Path:

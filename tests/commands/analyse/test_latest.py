@@ -1,6 +1,7 @@
 """`fitctl log list`, and `--latest` in place of a LOG: the newest run of the rig that is addressed."""
 
 import json
+import os
 
 import msgspec
 import pytest
@@ -188,3 +189,46 @@ def test_python_finds_the_newest_run_of_a_rig_by_its_records_not_by_the_names_of
     assert newest_run(logs, RIG) == [logs / "b.mcap"]
     assert newest_run(logs, "another") == [logs / "a.mcap"]
     assert newest_run(logs, "none") == []
+
+
+def damaged(path, written_s):
+    """A log of which a byte was changed in its index, last written then."""
+    content = bytearray(path.read_bytes())
+    content[-60] ^= 0xFF
+    path.write_bytes(content)
+    os.utime(path, (written_s, written_s))
+
+
+def test_latest_names_an_older_log_that_cannot_be_read_and_goes_on(fitctl, logs):
+    damaged(logs / "z.mcap", written_s=1.0)
+
+    status, text, problems = fitctl("log", "info", "--latest")
+
+    assert status == 0
+    assert text.startswith("logs/b.mcap: ")
+    (line,) = problems.splitlines()
+    assert line.startswith("logs/z.mcap: ")
+
+
+@pytest.mark.parametrize("command", [("log", "verify", "--latest"), ("report", "logs")])
+def test_a_newer_log_that_cannot_be_read_is_not_passed_over_for_an_older_night(
+    fitctl, logs, command
+):
+    (logs / "a.mcap").unlink()
+    os.utime(logs / "z.mcap", (1.0, 1.0))
+    damaged(logs / "b.mcap", written_s=2.0)
+
+    status, text, problem = fitctl(*command)
+
+    assert (status, text) == (2, "")
+    assert problem.count("\n") == 0
+    assert problem.startswith("logs/b.mcap: ")
+    assert "It was written after logs/z.mcap, so the newest run may be in it; name a LOG" in problem
+
+
+def test_reports_and_designs_of_a_folder_name_what_cannot_be_read_in_it(fitctl, logs):
+    (logs / "torn.mcap").write_bytes(b"nothing of MCAP")
+
+    for command in (("report", "logs"), ("design", "learn", "logs")):
+        _, _, problems = fitctl(*command, "--rig", default_rig_path())
+        assert problems.startswith("logs/torn.mcap: is not an MCAP log")
