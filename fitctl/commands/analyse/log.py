@@ -283,6 +283,7 @@ def recover(
             say(f"{log}: is not damaged; there is nothing to repair")
         return
     target = out or log.with_name(f"{log.stem}_recovered.mcap")
+    _insist_on_another(target, [log])
     saved = copying.recover(log, target, overwrite=overwrite)
     if as_json:
         say(to_json({"log": str(log), "out": str(target), **asdict(saved)}))
@@ -333,6 +334,7 @@ def cut(
             msg = f"cut: {log} ends before --from {from_}; choose an earlier --from"
         raise ConfigError(msg)
     target = out or log.with_name(f"{log.stem}_cut.mcap")
+    _insist_on_another(target, [log])
     topics = _topics(found, topic)
     records = copying.cut(
         log, target, from_ns=from_ns, to_ns=to_ns, topics=topics, overwrite=overwrite
@@ -354,6 +356,7 @@ def merge(
 
     For example the logs of one night, or the two halves of a log that a crash cut in two.
     """
+    _insist_on_another(out, logs)
     records, doubles = copying.merge(logs, out, overwrite=overwrite)
     if as_json:
         say(to_json({"out": str(out), "records": records, "doubles": doubles}))
@@ -409,6 +412,19 @@ def keep(
     for log in chosen_logs("log keep", logs, rig, latest=latest):
         folder.keep(log, kept=not undo)
         say(f"{log}: {'no longer kept' if undo else 'kept'}")
+
+
+def _insist_on_another(target: Path, logs: list[Path]) -> None:
+    """Refuse to overwrite a log with what is made from it, under whichever name: the rest of it would be lost.
+
+    Raises
+    ------
+    ConfigError
+        If the target is one of the logs.
+    """
+    if any(target.exists() and log.exists() and target.samefile(log) for log in logs):
+        msg = f"{target}: is the log itself, which must not change; give another name with --out"
+        raise ConfigError(msg)
 
 
 def _topics(found: LogInfo, patterns: list[str] | None) -> list[str]:

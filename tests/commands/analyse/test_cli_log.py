@@ -300,3 +300,20 @@ def test_bad_input_gets_one_clear_line_and_status_2(
     assert len(error.splitlines()) == 1
     assert error.count(said) == 1
     assert sorted(path.name for path in tmp_path.glob("*.mcap")) == ["a.mcap", "text.mcap"]
+
+
+@pytest.mark.parametrize("command", [("recover",), ("cut",), ("merge", "whole.mcap")])
+def test_a_log_is_never_overwritten_by_what_is_made_from_it(log, broken, monkeypatch, command):
+    monkeypatch.chdir(broken.parent)
+    write_log(broken.with_name("whole.mcap"), RECORDS)
+    broken.with_name("other_name.mcap").symlink_to(broken)
+    content = broken.read_bytes()
+
+    status, text, problem = log(*command, "broken.mcap", "--out", "other_name.mcap", "--overwrite")
+
+    assert (status, text) == (2, "")
+    assert problem == (
+        "other_name.mcap: is the log itself, which must not change; give another name with --out"
+    )
+    assert broken.read_bytes() == content
+    assert broken.with_name("other_name.mcap").is_symlink()
