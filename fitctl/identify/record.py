@@ -107,7 +107,8 @@ def gather(records: Iterable[Any], loop: str, name: str) -> ExperimentRecord:
         )
         raise IdentifyError(msg)
     table, tick = np.array(injected), tick_columns(ticks)
-    finite = all(np.isfinite(values).all() for values in (table, tick["time_s"]))
+    times_s = (tick["time_s"], tick["mid_exposure_s"])
+    finite = all(np.isfinite(values).all() for values in (table, *times_s))
     if not finite or any((np.diff(time_s) < 0).any() for time_s in (table[:, 0], tick["time_s"])):
         msg = (
             f"the experiment {name} on loop {loop} has times or voltages that are not finite, or times that "

@@ -64,7 +64,7 @@ _BEFORE_TICK = {
 _AT_THE_END = {DeviceHealth, LoopTiming, Overlap, RecorderStatus}
 _TICKS = {Tick, MetrologyTick}
 KINDS: set[Any] = _BEGIN | _BEFORE_TICK | _AT_THE_END | _TICKS | {FrameRecord}
-_TIMES = ("mid_exposure_s", "compute_s", "requested_s")  # of ticks
+_TIMES = ("time_s", "mid_exposure_s", "compute_s", "requested_s")  # of ticks
 _STACKS = ("stack1_v", "stack2_v", "stack3_v")
 _OF_PLACES = {
     kind: [name for name, field_type in get_type_hints(kind).items() if field_type is float]
@@ -277,13 +277,19 @@ def _insist_on_numbers(info: LogInfo, topic: str, kind: Any, message: Any, rig: 
         names = _STACKS
     for name in names:
         value = getattr(message, name, 0.0)
-        # The NaN of a tick's time stands for what there was not.
-        if abs(value) >= MOST or (kind not in _TICKS and math.isnan(value)):
+        if abs(value) >= MOST or (math.isnan(value) and not _was_not(kind, message, name)):
             msg = (
                 f"{info.path}: {topic} is not as fitctl records it: {name} is {value:g}; name a log that "
                 "fitctl recorded"
             )
             raise LogError(msg)
+
+
+def _was_not(kind: Any, message: Any, name: str) -> bool:
+    """Whether NaN stands for a time that there was not: that of a tick's frame, if it had none, or sample."""
+    if name == "mid_exposure_s":
+        return bool(message.number < 0)
+    return kind in _TICKS and name != "time_s"
 
 
 def _insist_on_field(info: LogInfo, tick: Any, field_name: str, lacks: str) -> None:

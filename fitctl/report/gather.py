@@ -249,10 +249,10 @@ def _fill(room: Columns, at: int, columns: Columns, time_s: NDArray[np.float64],
     _require(columns, dict.fromkeys(room, _NUMBERS), LATER_FIELDS, "ticks", path)
     block = columns | {"time_s": time_s}
     if "mid_exposure_s" in room:
-        if np.any(np.abs(columns["mid_exposure_s"]) >= MOST):
-            msg = f"{path}: mid_exposure_s of its ticks is no time; it was not recorded by fitctl"
-            raise LogError(msg)
-        block["mid_exposure_s"] = columns["mid_exposure_s"] + (time_s - columns["time_s"])
+        exposed_s, without_frame = columns["mid_exposure_s"], columns["number"] < 0
+        _insist_on_times("mid_exposure_s", exposed_s[~(without_frame & np.isnan(exposed_s))], path)
+        _insist_on_times("time_s", columns["time_s"], path)
+        block["mid_exposure_s"] = exposed_s + (time_s - columns["time_s"])
     rows = min(
         len(time_s), len(room["time_s"]) - at
     )  # a log in the making has grown since it was counted
@@ -262,6 +262,12 @@ def _fill(room: Columns, at: int, columns: Columns, time_s: NDArray[np.float64],
             values = np.clip(values, np.iinfo(column.dtype).min, np.iinfo(column.dtype).max)
         column[at : at + rows] = values
     return rows
+
+
+def _insist_on_times(name: str, times_s: NDArray[np.float64], path: str) -> None:
+    if not np.all(np.abs(times_s) < MOST):  # NaN is not
+        msg = f"{path}: {name} of its ticks is no time; it was not recorded by fitctl"
+        raise LogError(msg)
 
 
 def _whole(name: str, columns: Columns, path: str) -> Columns:

@@ -51,3 +51,11 @@ def test_the_last_experiment_of_a_name_is_gathered():
 def test_times_and_voltages_that_cannot_be_are_refused(rows, times_s):
     with pytest.raises(IdentifyError, match="not finite, or times that go back"):
         gather([START, *injected(*rows), *ticks(*times_s)], "right", "delay")
+
+
+def test_a_frame_s_time_that_is_not_a_number_is_refused():
+    (tick,) = ticks(0.1)
+    untimed = msgspec.structs.replace(tick, mid_exposure_s=math.nan)
+
+    with pytest.raises(IdentifyError, match="not finite, or times that go back"):
+        gather([START, *injected((0.0, 1.0)), untimed], "right", "delay")

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from samples.forged_logs import forged_of
 from samples.learner_reports import report
 from samples.log_samples import RUN_INFO, filled, frame, tick, write_log
 from samples.replay_courses import hold_a_star
@@ -202,6 +203,17 @@ def test_numbers_that_no_instrument_has_are_refused(tmp_path, name, value):
     path = write_log(tmp_path / "a.mcap", [RUN_INFO, tick(1, **{name: value}), frame(1)])
 
     refusal = rf"a\.mcap: /fit/right/tick is not as fitctl records it: {name} is "
+    with pytest.raises(LogError, match=refusal):
+        list(read_steps(log_info(path), load_rig(default_rig_path())))
+
+
+@pytest.mark.parametrize("name", ["mid_exposure_s", "time_s"])
+def test_a_frame_s_time_that_is_not_a_number_is_refused(tmp_path, name):
+    path = forged_of(
+        [RUN_INFO, tick(1), frame(1)], tmp_path / "a.mcap", "/fit/right/tick", **{name: math.nan}
+    )
+
+    refusal = rf"a\.mcap: /fit/right/tick is not as fitctl records it: {name} is nan"
     with pytest.raises(LogError, match=refusal):
         list(read_steps(log_info(path), load_rig(default_rig_path())))
 

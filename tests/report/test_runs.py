@@ -12,6 +12,7 @@ import pytest
 from google.protobuf.descriptor_pool import DescriptorPool
 from mcap.writer import Writer
 from mcap_protobuf.writer import Writer as McapWriter
+from samples.forged_logs import forged_of
 from samples.log_samples import filled
 from samples.logged_simulation import designs_of
 from samples.report_samples import record
@@ -169,16 +170,25 @@ def test_records_of_another_shape_are_refused_in_one_line(rig, tmp_path, kind, t
     assert "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize("value", [np.inf, -1e15])
-def test_a_time_that_is_none_is_refused(rig, tmp_path, value):
-    path = tmp_path / "odd.mcap"
+@pytest.mark.parametrize("name", ["mid_exposure_s", "time_s"])
+@pytest.mark.parametrize("value", [np.inf, -1e15, np.nan])
+def test_a_time_that_is_none_is_refused(rig, tmp_path, name, value):
+    info = run_info(rig, "simulated", now_s=0.0, designs=designs_of(rig))
+    records = [info, filled(Tick, loop="right")]
+    path = forged_of(records, tmp_path / "odd.mcap", "/fit/right/tick", **{name: value})
+
+    with pytest.raises(LogError, match=rf"odd\.mcap: {name} of its ticks is no time"):
+        gather(find_run([path]))
+
+
+def test_a_tick_without_a_frame_needs_no_time_of_one(rig, tmp_path):
+    path = tmp_path / "blind.mcap"
     info = run_info(rig, "simulated", now_s=0.0, designs=designs_of(rig))
     with LogWriter(path, rig.logging) as log:
         log.write(info, 1e9)
-        log.write(filled(Tick, loop="right", mid_exposure_s=value), 1e9)
+        log.write(filled(Tick, loop="right", number=-1, mid_exposure_s=np.nan), 1e9)
 
-    with pytest.raises(LogError, match=r"odd\.mcap: mid_exposure_s of its ticks is no time"):
-        gather(find_run([path]))
+    assert len(gather(find_run([path])).ticks["right"]["time_s"]) == 1
 
 
 def test_more_records_than_bytes_in_a_file_are_refused(rig, tmp_path):

@@ -1,0 +1,54 @@
+"""Logs with values that no recorder of fitctl writes: copies of one, with its messages changed."""
+
+from mcap.reader import make_reader
+from mcap.writer import Writer
+from samples.log_samples import write_log
+
+from fitctl.logging.reading import read_records
+
+
+def forged(source, target, change):
+    """Copy a log; `change` may alter each record's message, and returns its publish time, or None for its own.
+
+    Parameters
+    ----------
+    change : callable
+        Gets a :class:`fitctl.logging.reading.LogMessage`.
+    """
+    with source.open("rb") as stream, target.open("wb") as file:
+        reader = make_reader(stream)
+        summary = reader.get_summary()
+        writer = Writer(file)
+        writer.start()
+        for entry in reader.iter_metadata():
+            writer.add_metadata(entry.name, entry.metadata)
+        channels = {}
+        for channel in summary.channels.values():
+            schema = summary.schemas[channel.schema_id]
+            kind = writer.register_schema(schema.name, schema.encoding, schema.data)
+            channels[channel.topic] = writer.register_channel(
+                channel.topic, channel.message_encoding, kind
+            )
+        for record in read_records(source):
+            publish_ns = change(record)
+            writer.add_message(
+                channel_id=channels[record.topic],
+                log_time=record.log_time_ns,
+                data=record.message.SerializeToString(),
+                publish_time=record.publish_time_ns if publish_ns is None else publish_ns,
+                sequence=record.sequence,
+            )
+        writer.finish()
+    return target
+
+
+def forged_of(records, target, topic, **values):
+    """A log of sample records, where every message of a topic has these values."""
+
+    def change(record):
+        if record.topic == topic:
+            for name, value in values.items():
+                setattr(record.message, name, value)
+
+    source = write_log(target.with_name("as_recorded.mcap"), records)
+    return forged(source, target, change)
