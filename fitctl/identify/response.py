@@ -24,6 +24,7 @@ from fitctl.files import open_regular
 from fitctl.identify.drawing import BLACK, BLUE, VERMILION, new_figure
 from fitctl.identify.errors import IdentifyError
 from fitctl.identify.modes_fit import ModesFit, fit_modes, modes_response
+from fitctl.logging.records import MOST
 from fitctl.mocks.detector import DetectorBench
 from fitctl.model.detector import DETECTOR_RANGE_V, SAMPLE_RATE_HZ, mirror_angles_seen
 
@@ -240,8 +241,8 @@ def _read_columns(path: Path) -> list[Floats]:
     if len({column.shape for column in columns}) != 1 or columns[0].ndim != 1:
         msg = "columns of unequal length"
         raise ValueError(msg)
-    if not all(np.isfinite(column).all() for column in columns):
-        msg = "a value is missing or not a number"
+    if not all(np.all(np.abs(column) < MOST) for column in columns):  # NaN is not
+        msg = "a value is missing, not a number or beyond all that an instrument has"
         raise ValueError(msg)
     return columns
 
@@ -280,6 +281,18 @@ def _spectra(record: BenchRecord) -> tuple[Floats, Complexes, Floats]:
             "expected less; drive with a smaller amplitude or centre the spot"
         )
         raise IdentifyError(msg)
+    mirror_rad = mirror_angles_seen(record.detector_v).T
+    still = [
+        name
+        for name, values in (("drive_v", record.drive_rad), ("the detector", mirror_rad))
+        if not np.ptp(values, axis=-1).any()
+    ]
+    if still:
+        msg = (
+            f"response, {record.axis}: {still[0]} does not change; expected a mirror that is driven over the "
+            "whole band, and the spot on the detector; record it again"
+        )
+        raise IdentifyError(msg)
     longest_s = max(segment_s for _, _, segment_s in _BANDS)
     if len(record.drive_rad) < 2 * longest_s * record.rate_hz:
         msg = (
@@ -292,7 +305,7 @@ def _spectra(record: BenchRecord) -> tuple[Floats, Complexes, Floats]:
             f"response: sampled at {record.rate_hz:g} Hz; expected {2.5 * HIGHEST_HZ:g} Hz or more"
         )
         raise IdentifyError(msg)
-    drive_rad, mirror_rad = record.drive_rad, mirror_angles_seen(record.detector_v).T
+    drive_rad = record.drive_rad
     parts = []
     for low_hz, high_hz, segment_s in _BANDS:
         welch_of: dict[str, Any] = {
@@ -301,7 +314,8 @@ def _spectra(record: BenchRecord) -> tuple[Floats, Complexes, Floats]:
         }
         frequency_hz, driven = welch(drive_rad, **welch_of)
         _, cross = csd(drive_rad, mirror_rad, **welch_of)
-        _, coherent = coherence(drive_rad, mirror_rad, **welch_of)
+        with np.errstate(invalid="ignore"):  # with an axis that stands still, it is not defined
+            _, coherent = coherence(drive_rad, mirror_rad, **welch_of)
         # A stretch has its lower end and leaves its upper end to the next.
         inside = (frequency_hz > low_hz - 1e-9) & (frequency_hz < high_hz - 1e-9)
         parts.append((frequency_hz[inside], (cross / driven)[:, inside].T, coherent[:, inside].T))

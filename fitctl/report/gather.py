@@ -32,6 +32,7 @@ from fitctl.logging.records import (
     Tick,
 )
 from fitctl.logging.schemas import TOPICS
+from fitctl.messages.modes import Mode
 from fitctl.report.run import Run
 
 _ROWS = 2_000  # of a topic, held as they come before they find their place
@@ -94,6 +95,13 @@ TICK_FIELDS: dict[str, Any] = {
         np.float32,
     ),
 }
+
+_OF_A_HELD_STAR = (
+    *("error_az_px", "error_el_px", "fsm_az_rad", "fsm_el_rad"),
+    *("siderostat_az_rad", "siderostat_el_rad", "stack1_v", "stack2_v", "stack3_v"),
+)
+"""What is known at every tick in VERNIER with a star; elsewhere NaN stands for what there was not."""
+_LEAST_DN = 1e-6  # of a star: far less than one pixel's least digit
 
 LATER_FIELDS: dict[str, Any] = {"sky_az_rad": np.nan, "sky_el_rad": np.nan, "held": False}
 """What logs of earlier versions lack, and what it is there."""
@@ -253,6 +261,12 @@ def _fill(room: Columns, at: int, columns: Columns, time_s: NDArray[np.float64],
         _insist_on_times("mid_exposure_s", exposed_s[~(without_frame & np.isnan(exposed_s))], path)
         _insist_on_times("time_s", columns["time_s"], path)
         block["mid_exposure_s"] = exposed_s + (time_s - columns["time_s"])
+        held = columns["star_visible"] & (columns["mode_number"] == Mode.VERNIER)
+        for name in _OF_A_HELD_STAR:
+            _refuse(name, columns[name], held & np.isnan(columns[name]), "ticks", path)
+        flux_dn = columns["star_flux_dn"]  # by which the noise of the star's place is divided
+        _refuse("star_flux_dn", flux_dn, held & ~(flux_dn > _LEAST_DN), "ticks", path)
+    _insist_on_numbers(columns, "ticks", path)
     rows = min(
         len(time_s), len(room["time_s"]) - at
     )  # a log in the making has grown since it was counted
@@ -270,9 +284,28 @@ def _insist_on_times(name: str, times_s: NDArray[np.float64], path: str) -> None
         raise LogError(msg)
 
 
+def _insist_on_numbers(columns: Columns, what: str, path: str) -> None:
+    """Refuse infinite numbers and others that no instrument logs: no mean and no plot of them says anything."""
+    for name, values in columns.items():
+        if values.dtype.kind == "f":
+            _refuse(name, values, np.abs(values) >= MOST, what, path)
+
+
+def _refuse(
+    name: str, values: NDArray[Any], which: NDArray[np.bool_], what: str, path: str
+) -> None:
+    if which.any():
+        msg = (
+            f"{path}: {name} of its {what} is {values[which][0]:g}; expected a number that an instrument has; "
+            "name a log that fitctl recorded"
+        )
+        raise LogError(msg)
+
+
 def _whole(name: str, columns: Columns, path: str) -> Columns:
     """A block of records with the fields that logs of earlier versions lack, each as its default."""
     _require(columns, _FIELDS[name], _DEFAULTS[name], f"records of {name}", path)
+    _insist_on_numbers(columns, f"records of {name}", path)
     rows = len(columns["publish_time_ns"])
     filled = {each: np.full(rows, default) for each, default in _DEFAULTS[name].items()}
     return filled | columns

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import itertools
 import shutil
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterator, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -24,6 +24,7 @@ Floats = NDArray[np.floating]
 Limits = tuple[float, float]
 MOST_FIELDS = 12
 _ROWS = 20_000
+_LARGEST = 1e30  # the margins about a curve must be numbers, too, in 32 bits
 _TERMINAL_BINS = 400
 _COLOURS = ("blue", "orange", "green", "magenta", "cyan", "red")
 _MOST_PIECES = 40
@@ -32,12 +33,16 @@ UNITS = ("px", "v", "s", "rad", "arcsec", "dn", "fraction", "progress", "ns")
 
 
 class Series(NamedTuple):
-    """One field of one topic; times are seconds after the log's first record."""
+    """One field of one topic; times are seconds after the log's first record.
+
+    Of its values, `beyond` are infinite or too large for a plot, and NaN here.
+    """
 
     topic: str
     field: str
     time_s: Floats
     values: Floats
+    beyond: int = 0
 
     @property
     def unit(self) -> str:
@@ -89,6 +94,7 @@ def read_series(
         msg = f"{path}: {number} fields are too many to look at, at most {MOST_FIELDS}; choose of {names}"
         raise LogError(msg)
     parts: dict[tuple[str, str], list[Floats]] = defaultdict(list)
+    beyond: Counter[tuple[str, str]] = Counter()
     start_ns = round(info.start_s * 1e9)
     modes = None if mode is None else _modes(path, info)
     for topic, columns in column_blocks(path, list(chosen), _ROWS, chosen):
@@ -99,10 +105,19 @@ def read_series(
         if modes is not None and mode is not None:
             in_mode = _in_mode(modes, topic, utc_ns[inside], mode)
         for field in chosen[topic]:
-            values = columns[field][inside].astype(np.float32)
-            parts[topic, field].append(np.where(in_mode, values, np.float32(np.nan)))
+            values = np.where(in_mode, columns[field][inside], np.nan)
+            is_beyond = np.abs(values) > _LARGEST
+            beyond[topic, field] += int(np.count_nonzero(is_beyond))
+            values[is_beyond] = np.nan
+            parts[topic, field].append(values.astype(np.float32))
     found = [
-        Series(topic, field, np.concatenate(parts[topic, ""]), np.concatenate(parts[topic, field]))
+        Series(
+            topic,
+            field,
+            np.concatenate(parts[topic, ""]),
+            np.concatenate(parts[topic, field]),
+            beyond[topic, field],
+        )
         for topic, its in chosen.items()
         for field in its
     ]

@@ -152,6 +152,7 @@ def test_csv_reads_as_npz_does(rig, records, tmp_path):
         "time_s,drive_v\n0,1\n",
         "time_s,drive_v,detector_az_v,detector_el_v\n0,1,2,x\n",
         "time_s,drive_v,detector_az_v,detector_el_v\n0,1,2,nan\n1,1,2,3\n",
+        "time_s,drive_v,detector_az_v,detector_el_v\n0,1e300,2,3\n1,1e308,2,3\n",
         "time_s,drive_v,detector_az_v,detector_el_v\n0,0,0,0\n1,0,0,0\n9,0,0,0\n",
     ],
 )
@@ -180,6 +181,19 @@ def test_a_short_record_is_refused(records):
     )
     with pytest.raises(IdentifyError, match="expected at least 40 s"):
         response.analyse([short], "right")
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    ("still", "named"), [("drive_rad", "drive_v"), ("detector_v", "the detector")]
+)
+def test_a_record_of_a_mirror_that_nothing_moves_is_refused_without_a_warning(
+    records, still, named
+):
+    resting = dataclasses.replace(records[AZ], **{still: 0 * getattr(records[AZ], still)})
+
+    with pytest.raises(IdentifyError, match=f"{named} does not change"):
+        response.analyse([resting], "right")
 
 
 def test_the_same_axis_twice_and_no_axis_are_refused(records):

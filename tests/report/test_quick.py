@@ -1,5 +1,7 @@
 import numpy as np
 import pytest
+from samples.forged_logs import forged_of
+from samples.log_samples import RUN_INFO, tick
 
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import log_info, tick_arrays
@@ -161,3 +163,16 @@ def test_names_of_a_foreign_log_are_nothing_that_a_terminal_obeys(held):
 
     assert "\x1b" not in text
     assert "u001b[2J" in text
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("value", [np.inf, -1e300, 1e35])
+def test_values_that_no_plot_can_show_are_counted_and_left_out(tmp_path, value):
+    records = [RUN_INFO, tick(1), tick(2)]
+    path = forged_of(records, tmp_path / "a.mcap", "/fit/right/tick", error_az_px=value)
+
+    odd, usual = read_series(path, ["error_az_px", "error_el_px"])
+
+    assert (odd.beyond, usual.beyond) == (2, 0)
+    assert np.isnan(odd.values).all()
+    assert not np.isnan(usual.values).any()

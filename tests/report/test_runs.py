@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import itertools
 import json
 import re
 from pathlib import Path
@@ -22,9 +23,17 @@ from fitctl.daemon.run import run_info
 from fitctl.logging.copying import cut
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import log_info
-from fitctl.logging.records import DeviceHealth, Event, ModeChange, RecorderStatus, Tick
+from fitctl.logging.records import (
+    DeviceHealth,
+    Event,
+    LoopTiming,
+    ModeChange,
+    RecorderStatus,
+    Tick,
+)
 from fitctl.logging.schemas import TOPICS, message_class, run_metadata
 from fitctl.logging.writer import LogWriter
+from fitctl.messages.modes import Mode
 from fitctl.report.findings import find
 from fitctl.report.gather import gather
 from fitctl.report.run import find_run
@@ -178,6 +187,36 @@ def test_a_time_that_is_none_is_refused(rig, tmp_path, name, value):
     path = forged_of(records, tmp_path / "odd.mcap", "/fit/right/tick", **{name: value})
 
     with pytest.raises(LogError, match=rf"odd\.mcap: {name} of its ticks is no time"):
+        gather(find_run([path]))
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *itertools.product(
+            ["error_az_px", "stack1_v", "siderostat_el_rad"], [np.nan, np.inf, 1e300, -1e15]
+        ),
+        *(("star_flux_dn", value) for value in (np.nan, 0.0, 1e-300)),
+    ],
+)
+def test_numbers_that_no_instrument_has_are_refused(rig, tmp_path, name, value):
+    info = run_info(rig, "simulated", now_s=0.0, designs=designs_of(rig))
+    held = filled(Tick, loop="right", mode_number=Mode.VERNIER)
+    topic = "/fit/right/tick"
+    path = forged_of([info, held], tmp_path / "odd.mcap", topic, **{name: value})
+
+    refusal = rf"odd\.mcap: {name} of its ticks is .*; expected a number that an instrument has"
+    with pytest.raises(LogError, match=refusal):
+        gather(find_run([path]))
+
+
+def test_infinite_times_of_a_loop_are_refused(rig, tmp_path):
+    info = run_info(rig, "simulated", now_s=0.0, designs=designs_of(rig))
+    topic, records = "/fit/right/timing", [info, filled(LoopTiming, loop="right")]
+    path = forged_of(records, tmp_path / "odd.mcap", topic, compute_worst_s=np.inf)
+
+    with pytest.raises(LogError, match=r"compute_worst_s of its records of timing is inf"):
         gather(find_run([path]))
 
 

@@ -75,6 +75,12 @@ def plot(
             f"--to {to or 'its end'}"
         )
         raise ConfigError(msg)
+    for one in series:
+        if one.beyond:
+            say(
+                f"{log}: {one.beyond} values of {one.label} are infinite or too large to draw",
+                err=True,
+            )
     if ylim is not None and not 0 < ylim[1] - ylim[0] < math.inf:
         msg = (
             f"plot: --ylim {ylim[0]:g} {ylim[1]:g}: the first must be below the second, and their difference "

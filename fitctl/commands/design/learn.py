@@ -37,7 +37,8 @@ def learn(
     run = find_run(logs, rig_of(rig, overrides) if rig else None, overrides or ())
     say_unreadable(run.unreadable)
     require_loop("design learn", run.rig, loop)
-    with solving("design learn", loop):
+    advice = "look at the log with fitctl report, or at the rig file that --rig or --set gives"
+    with solving("design learn", loop, advice):
         found = _advice(run, loop)
     if out is not None:
         save_design(found.design, out)
