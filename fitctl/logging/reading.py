@@ -30,6 +30,7 @@ from fitctl.logging.indexed import IndexedReader
 from fitctl.logging.records import MOST, Tick
 from fitctl.logging.schemas import TOPICS
 
+_CLOCK_SET_S = 86_400.0  # by more, nobody sets the clock of a machine that records
 # By column: how it is gathered (a type code of the array module; texts in a list) and what it becomes.
 _Form = dict[str, tuple[str, Any]]
 _COLUMNS: dict[int, tuple[str, Any]] = {
@@ -348,6 +349,27 @@ def clock_of(path: Path, metadata: Mapping[str, Mapping[str, str]]) -> LogClock:
         msg = f"{path}: has no start of its run (metadata clock); name a log that fitctl recorded"
         raise LogError(msg)
     return found
+
+
+def own_times_s(log: LogInfo, start_s: float, end_s: float) -> tuple[float, float]:
+    """Between which times records can be by their own time, seconds since 1970.
+
+    Their own times are by the clock as it was when the run began, the log's by the clock as it was when they
+    were recorded: someone may have set it meanwhile. Of a log without the run's clock nothing is known.
+
+    Parameters
+    ----------
+    log : LogInfo
+        Of the run.
+    start_s, end_s : float
+        The log times of the first and the last record.
+    """
+    try:
+        began_s = sum(clock_of(log.path, log.metadata))
+    except LogError:
+        return -math.inf, math.inf
+    last_s = max(end_s, began_s + end_s - start_s)
+    return min(start_s, began_s) - _CLOCK_SET_S, last_s + _CLOCK_SET_S
 
 
 def logs_of_one_run_each(paths: Sequence[Path]) -> list[LogInfo]:

@@ -16,7 +16,7 @@ from mcap.writer import MCAP0_MAGIC
 from fitctl.logging.errors import LogError
 from fitctl.logging.files import DAMAGE, MEND, opened
 from fitctl.logging.folder import in_use
-from fitctl.logging.reading import log_info, read_records
+from fitctl.logging.reading import log_info, own_times_s, read_records
 from fitctl.logging.records import FrameRecord, RecorderStatus
 from fitctl.logging.schemas import TOPICS
 
@@ -60,15 +60,21 @@ def verify(path: Path) -> Verdict:
     if finished and problems:  # what its messages say is not worth reading
         return Verdict(in_order.total(), 0, 0, tuple(problems))
     counts: Counter[str] = Counter()
-    lost = last_lost = frames_missing = newest_ns = 0
+    lost = last_lost = frames_missing = newest_ns = misdated = 0
+    first_misdated = ""
     last_frame: int | None = None
     try:
+        info = log_info(path)
+        first_s, last_s = own_times_s(info, info.start_s, info.end_s)
         for entry in read_records(path):  # by the index, if there is one
             message: Any = entry.message
             counts[entry.topic] += 1
             if entry.log_time_ns < newest_ns:
                 problems.append(f"record {counts.total()} ({entry.topic}): its log time goes back")
             newest_ns = entry.log_time_ns
+            if not first_s <= entry.publish_time_ns / 1e9 <= last_s:
+                misdated += 1
+                first_misdated = first_misdated or f"record {counts.total()} ({entry.topic})"
             if entry.topic == TOPICS[RecorderStatus]:
                 now_lost = message.lost  # counts on while one recorder lives
                 lost += now_lost - last_lost if now_lost >= last_lost else now_lost
@@ -81,7 +87,12 @@ def verify(path: Path) -> Verdict:
                     problems.append(
                         f"frame {entry.sequence}: the size of its data does not match its header"
                     )
-        if finished and not in_order == counts == Counter(log_info(path).counts):
+        if misdated:
+            problems.append(
+                f"{first_misdated}: its own time is more than a day outside the log's; {misdated} records are "
+                "so, and reports leave them out"
+            )
+        if finished and not in_order == counts == Counter(info.counts):
             problems.append(f"its index is not of its contents; {MEND}")
     except LogError as error:
         problems.append(str(error).removeprefix(f"{path}: "))

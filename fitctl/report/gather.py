@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from fitctl.logging.errors import LogError
 from fitctl.logging.files import MEND
-from fitctl.logging.reading import HEADER, Columns, column_blocks
+from fitctl.logging.reading import HEADER, Columns, column_blocks, own_times_s
 from fitctl.logging.records import (
     MOST,
     ControllerChange,
@@ -156,6 +156,8 @@ class Gathered:
         Records with their fields; `changes` are of controllers; of `health` only what differs from before.
     lost : int or None
         Records lost on the way to the log; None if nothing says.
+    misdated : int
+        Records left out because their own time is far from the times of the run.
     """
 
     run: Run
@@ -168,6 +170,7 @@ class Gathered:
     health: list[dict[str, Any]]
     attempts: list[dict[str, Any]]
     lost: int | None
+    misdated: int
 
 
 def gather(run: Run) -> Gathered:
@@ -192,17 +195,20 @@ def gather(run: Run) -> Gathered:
     states: dict[str, str] = {}
     fields: dict[str, Any] = {topic: wanted for topic, (_, wanted) in series.items()}
     fields[TOPICS[RecorderStatus]] = list(_FIELDS["recorder"])
+    misdated = 0
     for log in run.logs:
-        for topic, columns in column_blocks(log.path, [*series, *places], _ROWS, fields):
+        for topic, block in column_blocks(log.path, [*series, *places], _ROWS, fields):
+            columns, left_out = _of_the_run(run, block)
+            misdated += left_out
             time_s = (columns["publish_time_ns"] - run.start_ns) / 1e9
             if topic in series:
                 filled[topic] += _fill(rooms[topic], filled[topic], columns, time_s, str(log.path))
                 continue
-            block = _whole(places[topic][0], columns, str(log.path)) | {"time_s": time_s}
+            whole = _whole(places[topic][0], columns, str(log.path)) | {"time_s": time_s}
             if places[topic][0] == "health":  # says the same every second, all night
-                health += _changes(_rows([block]), states)
+                health += _changes(_rows([whole]), states)
             else:
-                blocks[places[topic]].append(block)
+                blocks[places[topic]].append(whole)
     for topic, room in rooms.items():
         room.update({name: column[: filled[topic]] for name, column in room.items()})
         _in_order(room)
@@ -220,6 +226,7 @@ def gather(run: Run) -> Gathered:
         health=health,
         attempts=_rows(blocks["attempts", ""]),
         lost=_lost(_joined(blocks["recorder", ""])),
+        misdated=misdated,
     )
 
 
@@ -235,6 +242,15 @@ def _series(run: Run) -> dict[str, tuple[str, dict[str, Any]]]:
     if rig.fringes is not None:
         series[TOPICS[Overlap].format(loop=rig.fringes.loops[0])] = ("", OVERLAP_FIELDS)
     return series
+
+
+def _of_the_run(run: Run, block: Columns) -> tuple[Columns, int]:
+    """The records of a block whose own time can be of the run, and how many others there are."""
+    first_s, last_s = own_times_s(run.logs[-1], run.start_ns / 1e9, run.end_ns / 1e9)
+    own_s = block["publish_time_ns"] / 1e9
+    inside = (own_s >= first_s) & (own_s <= last_s)
+    left_out = int(np.count_nonzero(~inside))
+    return {name: column[inside] for name, column in block.items()} if left_out else block, left_out
 
 
 def _room(run: Run, topic: str, wanted: dict[str, Any]) -> Columns:
@@ -337,13 +353,12 @@ def _joined(blocks: list[Columns]) -> Columns:
 
 
 def _in_order(columns: Columns) -> Columns:
-    """What two files have both, because a recorder died between them, counts once."""
+    """In the order of time; what two files have both, because a recorder died between them, counts once."""
     time_s = columns["time_s"]
-    new = np.ones(len(time_s), bool)
-    new[1:] = time_s[1:] > np.maximum.accumulate(time_s)[:-1]
-    if not new.all():
+    if np.any(np.diff(time_s) <= 0):
+        _, rows = np.unique(time_s, return_index=True)  # of the same time, the first
         for name in columns:  # one by one: all at once, hours would be held twice
-            columns[name] = columns[name][new]
+            columns[name] = columns[name][rows]
     return columns
 
 

@@ -99,6 +99,7 @@ def plain(findings: Findings) -> dict[str, Any]:
         "duration_s": run.duration_s,
         "verdict": findings.word,
         "records_lost": findings.gathered.lost,
+        "records_misdated": findings.gathered.misdated,
         "loops": {name: _plain_loop(loop) for name, loop in findings.loops.items()},
         "fringes": None if findings.fringes is None else findings.fringes.figures._asdict(),
     }

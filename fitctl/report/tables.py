@@ -251,6 +251,10 @@ def losses(findings: Findings) -> Table:
     lost = findings.gathered.lost
     unfinished = [str(log.path.name) for log in run.logs if not log.finished]
     caption = f"Losses. Records lost on the way to the log: {UNKNOWN if lost is None else lost}."
+    if findings.gathered.misdated:
+        caption += (
+            f" Left out: {findings.gathered.misdated} records whose own time is not of the run."
+        )
     if unfinished:
         caption += f" Not finished, so that its end may be missing: {', '.join(unfinished)}."
     return Table(

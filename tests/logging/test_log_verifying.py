@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import MCAP0_MAGIC
+from samples.forged_logs import forged
 from samples.log_samples import (
     RUN_INFO,
     SETTINGS,
@@ -84,6 +85,18 @@ def test_a_frame_that_is_not_as_large_as_it_says_and_a_time_that_goes_back_are_n
     assert problems == (
         "record 2 (/fit/camera/frame): its log time goes back",
         "frame 9: the size of its data does not match its header",
+    )
+
+
+def test_records_whose_own_time_is_not_the_logs_are_named(tmp_path):
+    whole = write_log(tmp_path / "a.mcap", [RUN_INFO, *(tick(n) for n in range(1, 6))])
+    wrong_ns = {2: 2**62, 4: 0}
+    path = forged(whole, tmp_path / "b.mcap", lambda record: wrong_ns.get(record.sequence))
+
+    assert verify(whole).problems == ()
+    assert verify(path).problems == (
+        "record 2 (/fit/right/tick): its own time is more than a day outside the log's; 2 records are so, and "
+        "reports leave them out",
     )
 
 

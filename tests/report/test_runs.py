@@ -13,7 +13,7 @@ import pytest
 from google.protobuf.descriptor_pool import DescriptorPool
 from mcap.writer import Writer
 from mcap_protobuf.writer import Writer as McapWriter
-from samples.forged_logs import forged_of
+from samples.forged_logs import forged, forged_of
 from samples.log_samples import filled
 from samples.logged_simulation import designs_of
 from samples.report_samples import record
@@ -37,6 +37,7 @@ from fitctl.messages.modes import Mode
 from fitctl.report.findings import find
 from fitctl.report.gather import gather
 from fitctl.report.run import find_run
+from fitctl.report.tables import losses
 
 
 @pytest.fixture
@@ -228,6 +229,35 @@ def test_a_tick_without_a_frame_needs_no_time_of_one(rig, tmp_path):
         log.write(filled(Tick, loop="right", number=-1, mid_exposure_s=np.nan), 1e9)
 
     assert len(gather(find_run([path])).ticks["right"]["time_s"]) == 1
+
+
+@pytest.mark.parametrize("wrong_ns", [0, 2**62])
+def test_one_record_of_a_wrong_time_leaves_the_others(held, findings, tmp_path, wrong_ns):
+    def change(record):
+        is_it = record.topic == "/fit/right/tick" and record.sequence == 1000
+        return wrong_ns if is_it else None
+
+    found = find(find_run([forged(held[1], tmp_path / "forged.mcap", change)]))
+
+    expected = findings.loops["right"].ticks["number"]
+    np.testing.assert_array_equal(found.loops["right"].ticks["number"], expected[expected != 1000])
+    assert (found.gathered.misdated, findings.gathered.misdated) == (1, 0)
+    assert "Left out: 1 records" in losses(found).caption
+    assert "Left out" not in losses(findings).caption
+
+
+def test_records_that_come_out_of_their_order_are_all_there(held, findings, tmp_path):
+    """One tick has a time of an hour later: those after it are no copies of earlier ones."""
+
+    def change(record):
+        is_it = record.topic == "/fit/right/tick" and record.sequence == 1000
+        return record.publish_time_ns + 3600 * 10**9 if is_it else None
+
+    found = find(find_run([forged(held[1], tmp_path / "forged.mcap", change)]))
+
+    ticks, expected = found.loops["right"].ticks, findings.loops["right"].ticks
+    assert sorted(ticks["number"]) == sorted(expected["number"])
+    assert ticks["number"][-1] == 1000
 
 
 def test_more_records_than_bytes_in_a_file_are_refused(rig, tmp_path):

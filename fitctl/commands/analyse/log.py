@@ -20,6 +20,7 @@ from fitctl.commands.shared.logs import (
     chosen_log,
     chosen_logs,
     logging_rig,
+    say_left_out,
 )
 from fitctl.commands.shared.options import JsonOption, OverwriteOption, RigOption, SetOption
 from fitctl.commands.shared.printing import say, to_json
@@ -205,6 +206,7 @@ def _summary(log: Path, most_bytes: int) -> LogSummary:
             line.error = _TOO_LARGE
             return line
         findings = find(find_run([log]))
+        say_left_out(findings.gathered)
     except (LogError, ConfigError) as error:
         line.error = str(error)
         return line

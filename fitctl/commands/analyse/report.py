@@ -10,7 +10,7 @@ import msgspec
 import typer
 
 from fitctl.commands.shared.exits import FAILED
-from fitctl.commands.shared.logs import LatestOption, chosen_logs, say_unreadable
+from fitctl.commands.shared.logs import LatestOption, chosen_logs, say_left_out, say_unreadable
 from fitctl.commands.shared.printing import say, to_json
 from fitctl.commands.shared.rig import rig_of
 from fitctl.config import ConfigError
@@ -69,6 +69,8 @@ def report(
     runs = [find_run([log], settings) for log in logs] if compare else [find_run(logs, settings)]
     say_unreadable(problem for run in runs for problem in run.unreadable)
     nights = [find(run) for run in runs]
+    for night in nights:
+        say_left_out(night.gathered)
     name = "comparison" if compare else f"{runs[0].name}_report"
     first = runs[0].logs[0].path
     folder = out or first.with_name(name)

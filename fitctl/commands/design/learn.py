@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fitctl.commands.shared.logs import say_unreadable
+from fitctl.commands.shared.logs import say_left_out, say_unreadable
 from fitctl.commands.shared.opened import opened_loop
 from fitctl.commands.shared.printing import say_lines, to_json
 from fitctl.commands.shared.rig import require_loop, rig_of
@@ -48,7 +48,9 @@ def learn(
 
 
 def _advice(run: Run, loop_name: str) -> Advice:
-    loop = opened_loop(gather(run), loop_name)
+    gathered = gather(run)
+    say_left_out(gathered)
+    loop = opened_loop(gathered, loop_name)
     return advise(
         loop.series,
         loop.measured_px,

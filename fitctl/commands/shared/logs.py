@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,6 +13,9 @@ from fitctl.commands.shared.rig import rig_of
 from fitctl.commands.shared.supervisor import address_or_shipped
 from fitctl.config import ConfigError, Rig
 from fitctl.logging.listing import find_newest
+
+if TYPE_CHECKING:
+    from fitctl.report.gather import Gathered
 
 LatestOption = Annotated[
     bool, typer.Option("--latest", help="Use the newest log of the rig, in place of LOG.")
@@ -64,6 +67,16 @@ def say_unreadable(problems: Iterable[str]) -> None:
     """Name the files that could not be read where the newest run was chosen, a line each."""
     for problem in problems:
         say(problem, err=True)
+
+
+def say_left_out(gathered: Gathered) -> None:
+    """Say how many records of a run were not read, because their times are not of it."""
+    if gathered.misdated:
+        say(
+            f"{gathered.run.name}: {gathered.misdated} records are left out: their own time is more than a day "
+            "outside the run's; see fitctl log verify",
+            err=True,
+        )
 
 
 def chosen_log(command: str, log: Path | None, rig: Path | None, *, latest: bool) -> Path:

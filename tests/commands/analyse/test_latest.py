@@ -5,6 +5,7 @@ import os
 
 import msgspec
 import pytest
+from samples.forged_logs import forged
 from samples.log_samples import RUN_INFO, WALL_S, one_of_each, tick, write_log
 
 from fitctl.cli import main
@@ -189,6 +190,16 @@ def test_python_finds_the_newest_run_of_a_rig_by_its_records_not_by_the_names_of
     assert newest_run(logs, RIG) == [logs / "b.mcap"]
     assert newest_run(logs, "another") == [logs / "a.mcap"]
     assert newest_run(logs, "none") == []
+
+
+def test_a_report_says_how_many_records_it_leaves_out(fitctl, logs):
+    forged(logs / "a.mcap", logs / "c.mcap", lambda record: {2: 2**62}.get(record.sequence))
+
+    _, _, problem = fitctl("report", "logs/c.mcap", "--rig", default_rig_path())
+
+    assert problem == (
+        "c: 1 records are left out: their own time is more than a day outside the run's; see fitctl log verify"
+    )
 
 
 def damaged(path, written_s):
