@@ -83,8 +83,8 @@ def read_dark(path: Path, shape: tuple[int, int]) -> Floats:
     """
     try:
         dark_dn = np.load(io.BytesIO(dark_bytes(path)), allow_pickle=False)
-    except (ValueError, EOFError) as error:
-        msg = f"camera.dark_file {path}: cannot be read: {error}; {_MEASURE}"
+    except (ValueError, EOFError):  # numpy's own words advise to unpickle it
+        msg = f"camera.dark_file {path}: cannot be read: it is no NumPy file (.npy) of numbers; {_MEASURE}"
         raise ConfigError(msg) from None
     if not isinstance(dark_dn, np.ndarray) or dark_dn.dtype.kind != "f" or dark_dn.shape != shape:
         msg = f"camera.dark_file {path}: must hold {shape[0]} x {shape[1]} floats; {_MEASURE}"

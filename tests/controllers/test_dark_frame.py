@@ -137,5 +137,6 @@ def test_a_file_that_is_no_dark_frame_is_refused_in_one_line(tmp_path, name):
 
     assert str(caught.value).startswith(f"camera.dark_file {path}: ")
     assert said in str(caught.value)
+    assert "pickle" not in str(caught.value)
     assert str(caught.value).endswith("measure it again: fitctl sequence run dark")
     assert "\n" not in str(caught.value)
