@@ -9,3 +9,7 @@ class LogError(Exception):
 
 class NoLogError(LogError):
     """A file that is no MCAP log at all, so that no run can be lost in it."""
+
+
+class ForeignTopicError(LogError):
+    """A topic in another format than protobuf, as another program writes it: that is no damage."""

@@ -14,7 +14,7 @@ import google.protobuf.message
 import lz4.frame
 import mcap.stream_reader
 import zstandard
-from mcap.exceptions import DecoderNotFoundError, McapError
+from mcap.exceptions import McapError
 from mcap.records import Channel, Schema
 from mcap.writer import MCAP0_MAGIC
 
@@ -126,13 +126,17 @@ def up_to_the_tear(path: Path, finished: bool) -> Iterator[None]:
     """Damage ends a cut file; in a finished file it is an error."""
     try:
         yield
-    except DecoderNotFoundError as error:
-        msg = (
-            f"{path}: has topics in another format ({error}); expected protobuf, as fitctl records them; leave "
-            "them out with --topic"
-        )
-        raise LogError(msg) from error
     except DAMAGE as error:
         if finished:
-            msg = f"{path}: is damaged: {error}; {MEND}"
+            msg = f"{path}: {damaged(error)}"
             raise LogError(msg) from error
+
+
+def damaged(error: Exception) -> str:
+    """What is wrong with a log that made a reader raise this, also where the error itself has no words."""
+    words = str(error)
+    if not words or isinstance(error, KeyError):  # whose words are only the key
+        words = (
+            f"its records do not fit together ({' '.join([type(error).__name__, words]).strip()})"
+        )
+    return f"is damaged: {words}; {MEND}"

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from array import array
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -19,12 +19,13 @@ import numpy as np
 from google.protobuf.descriptor import FieldDescriptor
 from mcap.exceptions import McapError
 from mcap.reader import NonSeekingReader, SeekingReader
-from mcap.records import Channel, Message, Metadata
+from mcap.records import Channel, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
+from mcap.well_known import MessageEncoding
 from mcap_protobuf.decoder import DecoderFactory
 from numpy.typing import NDArray
 
-from fitctl.logging.errors import LogError
+from fitctl.logging.errors import ForeignTopicError, LogError
 from fitctl.logging.files import Described, opened, up_to_the_tear
 from fitctl.logging.indexed import IndexedReader
 from fitctl.logging.records import MOST, Tick
@@ -137,17 +138,35 @@ def read_records(path: Path, topics: Collection[str] | None = None) -> Iterator[
     """
     with opened(path) as (stream, finished), up_to_the_tear(path, finished):
         kind = IndexedReader if finished else NonSeekingReader
-        reader = kind(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        reader = kind(stream, validate_crcs=True)
         # An index is as large in the file as in memory, but chunks unpack to more.
         if isinstance(reader, NonSeekingReader):
             reader._schemas, reader._channels = Described(path), Described(path)
+        factory, decoders = DecoderFactory(), dict[int, Callable[[bytes], Any]]()
         # Not ordered by log time: it is already, and sorting a cut file gives nothing at all.
-        for _, channel, header, message in reader.iter_decoded_messages(
-            topics, log_time_order=False
-        ):
+        for schema, channel, entry in reader.iter_messages(topics, log_time_order=False):
+            decode = decoders.get(channel.id)
+            if decode is None:
+                decode = factory.decoder_for(channel.message_encoding, schema)
+                if decode is None:
+                    raise _of_another_format(path, channel, schema)
+                decoders[channel.id] = decode
             yield LogMessage(
-                channel.topic, message, header.log_time, header.publish_time, header.sequence
+                channel.topic,
+                decode(entry.data),
+                entry.log_time,
+                entry.publish_time,
+                entry.sequence,
             )
+
+
+def _of_another_format(path: Path, channel: Channel, schema: Schema | None) -> ForeignTopicError:
+    form = channel.message_encoding or "no named format"
+    if form == MessageEncoding.Protobuf:  # with a schema of another kind
+        form = f"protobuf with a schema in {(schema and schema.encoding) or 'no named format'}"
+    return ForeignTopicError(
+        f"{path}: has topics in another format than fitctl's: {channel.topic} is in {form}; expected protobuf"
+    )
 
 
 def column_blocks(
@@ -185,7 +204,7 @@ def column_blocks(
     blocks: dict[str, _Block] = {}
     classes: dict[str, type] = {}
     forms: dict[str, _Form] = {}
-    for entry in read_records(path, topics):
+    for entry in _read_for_columns(path, topics):
         if classes.get(entry.topic) is not type(entry.message):
             classes[entry.topic] = type(entry.message)
             form = _form(entry.message, chosen.get(entry.topic))
@@ -211,6 +230,14 @@ def column_blocks(
             del blocks[entry.topic]
     for topic, block in blocks.items():
         yield topic, block.columns(f"{path}: {topic}")
+
+
+def _read_for_columns(path: Path, topics: Collection[str] | None) -> Iterator[LogMessage]:
+    try:
+        yield from read_records(path, topics)
+    except ForeignTopicError as error:
+        msg = f"{error}; leave them out with --topic"
+        raise ForeignTopicError(msg) from None
 
 
 def tick_arrays(path: Path, loop: str) -> Columns:

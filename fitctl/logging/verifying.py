@@ -13,8 +13,8 @@ from mcap.records import Channel, DataEnd, Footer, Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC
 
-from fitctl.logging.errors import LogError
-from fitctl.logging.files import DAMAGE, MEND, opened
+from fitctl.logging.errors import ForeignTopicError, LogError
+from fitctl.logging.files import DAMAGE, MEND, damaged, opened
 from fitctl.logging.folder import in_use
 from fitctl.logging.reading import log_info, own_times_s, read_records
 from fitctl.logging.records import FrameRecord, RecorderStatus
@@ -53,7 +53,7 @@ def verify(path: Path) -> Verdict:
     Raises
     ------
     LogError
-        If it is missing, or no MCAP log at all.
+        If it is missing, no MCAP log at all, or has topics in another format than protobuf.
     """
     with opened(path) as (stream, finished):
         in_order, problems = _checked(stream) if finished else (Counter(), [_unfinished(path)])
@@ -94,6 +94,8 @@ def verify(path: Path) -> Verdict:
             )
         if finished and not in_order == counts == Counter(info.counts):
             problems.append(f"its index is not of its contents; {MEND}")
+    except ForeignTopicError:
+        raise
     except LogError as error:
         problems.append(str(error).removeprefix(f"{path}: "))
     return Verdict(counts.total(), lost, frames_missing, tuple(problems))
@@ -126,7 +128,7 @@ def _checked(stream: IO[bytes]) -> tuple[Counter[str], list[str]]:
         stream.seek(footer.summary_start)
         summary_crc = zlib.crc32(stream.read(size - _AFTER_SUMMARY_BYTES - footer.summary_start))
     except DAMAGE as error:
-        return counts, [f"is damaged: {error}; {MEND}"]
+        return counts, [damaged(error)]
     if footer.summary_crc not in {0, summary_crc}:
         return counts, [f"its index is damaged: wrong checksum; {MEND}"]
     return counts, []

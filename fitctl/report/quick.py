@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import itertools
 import shutil
@@ -14,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.logging.errors import LogError
+from fitctl.logging.errors import ForeignTopicError, LogError
 from fitctl.logging.reading import HEADER, LogInfo, column_blocks, log_info
 from fitctl.messages.modes import Mode
 from fitctl.report.drawing import SERIES, TimeAxis, envelope, panels, styled, time_axis, trace
@@ -81,7 +82,7 @@ def read_series(
     """
     info = log_info(path)
     fields = {
-        topic: _fields(path, topic) for topic in sorted(info.counts) if not topic.endswith("/frame")
+        topic: [] if _is_pictures(topic) else _fields(path, topic) for topic in sorted(info.counts)
     }
     chosen: dict[str, list[str]] = defaultdict(list)
     for text in wanted:
@@ -162,13 +163,20 @@ def _in_mode(modes: _Modes, topic: str, utc_ns: Any, mode: Mode) -> NDArray[np.b
 
 def _fields(path: Path, topic: str) -> list[str]:
     """The numbers that a topic has."""
-    for _, columns in column_blocks(path, [topic], 1):
-        return [
-            name
-            for name, column in columns.items()
-            if column.dtype.kind in "fib" and name not in {*HEADER, "time_s"}
-        ]
+    with contextlib.suppress(
+        ForeignTopicError
+    ):  # one of another program hinders no plot of fitctl's
+        for _, columns in column_blocks(path, [topic], 1):
+            return [
+                name
+                for name, column in columns.items()
+                if column.dtype.kind in "fib" and name not in {*HEADER, "time_s"}
+            ]
     return []
+
+
+def _is_pictures(topic: str) -> bool:
+    return topic.endswith("/frame")
 
 
 def _matching(path: Path, text: str, fields: dict[str, list[str]]) -> list[tuple[str, str]]:
@@ -182,6 +190,14 @@ def _matching(path: Path, text: str, fields: dict[str, list[str]]) -> list[tuple
         for field in fields[topic]
         if fnmatchcase(field, field_part)
     ]
+    if not found and topics and not any(fields[topic] for topic in topics):
+        why = "without numbers to plot"
+        if any(map(_is_pictures, topics)):
+            why = (
+                "of pictures, which cannot be plotted; `fitctl log export --format npz` writes them"
+            )
+        msg = f"{path}: {', '.join(topics)} is {why}"
+        raise LogError(msg)
     if not found:
         msg = f"{path}: has no {text}; {_suggestion(topic_part, field_part, topics, fields)}"
         raise LogError(msg)

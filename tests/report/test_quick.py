@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
-from samples.forged_logs import forged_of
-from samples.log_samples import RUN_INFO, tick
+from samples.forged_logs import forged_of, with_topic_of_another_program
+from samples.log_samples import RUN_INFO, frame, tick, write_log
 
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import log_info, tick_arrays
@@ -176,3 +176,16 @@ def test_values_that_no_plot_can_show_are_counted_and_left_out(tmp_path, value):
     assert (odd.beyond, usual.beyond) == (2, 0)
     assert np.isnan(odd.values).all()
     assert not np.isnan(usual.values).any()
+
+
+def test_pictures_and_topics_of_other_programs_are_called_what_they_are(tmp_path):
+    path = write_log(tmp_path / "a.mcap", [RUN_INFO, tick(1), frame(1)])
+    with pytest.raises(
+        LogError, match=r"camera/frame is of pictures, .*`fitctl log export --format npz`"
+    ):
+        read_series(path, ["/fit/camera/frame"])
+
+    odd = with_topic_of_another_program(tmp_path / "b.mcap")
+    assert labels(read_series(odd, ["number"])) == ["/fit/right/tick.number"]
+    with pytest.raises(LogError, match=r"b\.mcap: /odo is without numbers to plot"):
+        read_series(odd, ["/odo"])

@@ -2,18 +2,20 @@
 
 from mcap.reader import make_reader
 from mcap.writer import Writer
-from samples.log_samples import write_log
+from samples.log_samples import RUN_INFO, tick, write_log
 
 from fitctl.logging.reading import read_records
 
 
-def forged(source, target, change):
+def forged(source, target, change, add=lambda _: None):
     """Copy a log; `change` may alter each record's message, and returns its publish time, or None for its own.
 
     Parameters
     ----------
     change : callable
         Gets a :class:`fitctl.logging.reading.LogMessage`.
+    add : callable, optional
+        Gets the library's writer at the end, for more records.
     """
     with source.open("rb") as stream, target.open("wb") as file:
         reader = make_reader(stream)
@@ -38,6 +40,7 @@ def forged(source, target, change):
                 publish_time=record.publish_time_ns if publish_ns is None else publish_ns,
                 sequence=record.sequence,
             )
+        add(writer)
         writer.finish()
     return target
 
@@ -52,3 +55,14 @@ def forged_of(records, target, topic, **values):
 
     source = write_log(target.with_name("as_recorded.mcap"), records)
     return forged(source, target, change)
+
+
+def with_topic_of_another_program(target):
+    """A log of a tick, with a topic in JSON."""
+    source = write_log(target.with_name("as_recorded.mcap"), [RUN_INFO, tick(1)])
+
+    def add(writer):
+        channel = writer.register_channel("/odo", "json", schema_id=0)
+        writer.add_message(channel, log_time=2 * 10**18, data=b"{}", publish_time=2 * 10**18)
+
+    return forged(source, target, lambda _: None, add)

@@ -171,11 +171,17 @@ def summary(
         elif unreadable:
             say(line.error, err=True)
         else:
-            start = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(line.start_s or 0.0))
             rms = ", ".join(f"{name} {text}" for name, text in line.rms.items())
-            words = f"{start}, {line.duration_s or 0.0:.0f} s, requirement {line.verdict}"
+            words = f"{_span(line)}, requirement {line.verdict}"
             say(f"{log}: {line.error or words}" + (f": {rms}" if rms else ""))
     raise typer.Exit(UNUSABLE if failed else 0)
+
+
+def _span(line: LogSummary) -> str:
+    if line.start_s is None or line.duration_s is None:
+        return "without any record"
+    start = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(line.start_s))
+    return f"{start}, {line.duration_s:.0f} s"
 
 
 class LogSummary(msgspec.Struct, kw_only=True):
@@ -326,6 +332,9 @@ def cut(
     """
     log = chosen_log("log cut", log, rig, latest=latest)
     found = log_info(log)
+    if not found.counts:
+        msg = f"cut: {log} has no record, so there is nothing to cut; name another log"
+        raise ConfigError(msg)
     from_ns = time_ns("--from", from_, found)
     to_ns = 2**64 if to is None else time_ns("--to", to, found)  # MCAP has unsigned 64 bit
     if to_ns <= from_ns:

@@ -65,7 +65,10 @@ def plot(
         raise ConfigError(msg)
     log = chosen_logs("plot", named, rig, latest=latest)[-1]
     found = log_info(log)
-    from_ns = time_ns("--from", from_, found) if found.counts else 0
+    if not found.counts:
+        msg = f"plot: {log} has no record, so there is nothing to plot; name another log"
+        raise ConfigError(msg)
+    from_ns = time_ns("--from", from_, found)
     to_ns = 2**63 - 1 if to is None else time_ns("--to", to, found)
     series = read_series(log, what, from_ns, to_ns, None if mode is None else _mode(mode))
     if not any(len(one.time_s) for one in series):
@@ -87,12 +90,14 @@ def plot(
             "finite"
         )
         raise ConfigError(msg)
-    if out is not None:
-        _save(as_figure(log, series, ylim), out)
-    elif window:
-        _show(as_figure(log, series, ylim))
-    else:
+    if out is None and not window:
         print(as_text(log, series, ylim, colours=sys.stdout.isatty()))
+        return
+    figure = as_figure(log, series, ylim)
+    if out is not None:
+        _save(figure, out)
+    if window:
+        _show(figure)
 
 
 def _mode(text: str) -> Mode:

@@ -7,6 +7,8 @@ import sys
 
 import numpy as np
 import pytest
+from mcap.exceptions import EndOfFile
+from samples.forged_logs import with_topic_of_another_program
 from samples.log_samples import (
     RUN_INFO,
     SETTINGS,
@@ -317,3 +319,40 @@ def test_a_log_is_never_overwritten_by_what_is_made_from_it(log, broken, monkeyp
     )
     assert broken.read_bytes() == content
     assert broken.with_name("other_name.mcap").is_symlink()
+
+
+def test_a_log_of_another_program_is_not_called_damaged(log, tmp_path):
+    path = with_topic_of_another_program(tmp_path / "b.mcap")
+
+    status, text, problem = log("verify", path)
+
+    assert (status, text) == (2, "")
+    assert problem == (
+        f"{path}: has topics in another format than fitctl's: /odo is in json; expected protobuf"
+    )
+
+
+def test_damage_without_words_has_words(log, whole, monkeypatch):
+    def end(*_, **__):
+        raise EndOfFile
+
+    monkeypatch.setattr("fitctl.logging.verifying.StreamReader", end)
+    monkeypatch.setattr("fitctl.logging.reading.SeekingReader", end)
+
+    for command in ("verify", "info"):
+        _, text, problem = log(command, whole)
+        assert "is damaged: its records do not fit together (EndOfFile); `fitctl" in text + problem
+
+
+def test_a_log_without_records_is_called_that(log, tmp_path, capsys):
+    path = write_log(tmp_path / "zero.mcap", [RUN_INFO])
+
+    assert log("cut", path) == (
+        2,
+        "",
+        f"cut: {path} has no record, so there is nothing to cut; name another log",
+    )
+    with pytest.raises(SystemExit) as end:
+        main(["plot", str(path), "error_az_px"])
+    assert end.value.code == 2
+    assert "zero.mcap has no record, so there is nothing to plot" in capsys.readouterr().err

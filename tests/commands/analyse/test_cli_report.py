@@ -198,6 +198,21 @@ def test_a_plot_in_the_terminal_and_as_a_picture(log, fitctl, tmp_path, monkeypa
     assert picture.read_text().count("<svg") == 1
 
 
+def test_a_plot_is_both_a_picture_and_a_window_if_both_are_asked_for(
+    log, fitctl, tmp_path, monkeypatch
+):
+    shown = []
+    monkeypatch.setattr("fitctl.commands.analyse.plot._show", shown.append)
+
+    status, text, _ = fitctl(
+        "plot", log, "star_flux_dn", "--window", "--out", tmp_path / "flux.png"
+    )
+
+    assert status in {0, None}
+    assert len(shown) == 1
+    assert (tmp_path / "flux.png").exists()
+
+
 def test_without_a_display_a_window_is_refused_with_what_to_do(log, fitctl, monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "agg")
     import matplotlib

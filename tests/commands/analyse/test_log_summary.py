@@ -4,10 +4,12 @@ import json
 
 import pytest
 from samples.log_samples import RUN_INFO, tick, write_log
+from samples.logged_simulation import designs_of
 from samples.report_samples import record
 
 from fitctl.cli import main
 from fitctl.config import default_rig_path, load_rig
+from fitctl.daemon.run import run_info
 
 
 @pytest.fixture
@@ -67,3 +69,12 @@ def test_a_log_whose_rig_is_of_another_version_does_not_end_the_list(tmp_path, c
     first, second = (json.loads(line)["error"] for line in lines)
     assert "old.mcap: rig file in it" in first
     assert "none.mcap" in second
+
+
+def test_a_log_without_records_has_no_start(tmp_path, capsys):
+    rig = load_rig(default_rig_path())
+    path = write_log(
+        tmp_path / "zero.mcap", [run_info(rig, "simulated", now_s=0.0, designs=designs_of(rig))]
+    )
+
+    assert printed(capsys, path) == (0, [f"{path}: without any record, requirement not known"])
