@@ -50,6 +50,14 @@ Marks = dict[str, Any]
 """The tables of a rig, each value replaced with its `Mark`."""
 
 
+class Given(dict[str, Any]):
+    """The marks of a table that one layer gave as a whole, perhaps without a value to show whose it is."""
+
+    def __init__(self, marks: Marks, layer: Layer) -> None:
+        super().__init__(marks)
+        self.layer = layer
+
+
 def lies_on(under: Any, value: Any) -> TypeGuard[dict[str, Any]]:
     """Whether a table is laid over another; a table that names another driver replaces the other one."""
     return (
@@ -73,7 +81,7 @@ def mark_layer(
 
 def _mark(value: Any, layer: Layer, below: Any, before: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _mark(each, layer, None, None) for key, each in value.items()}
+        return Given({key: _mark(each, layer, None, None) for key, each in value.items()}, layer)
     if isinstance(before, Mark) and value == below:
         return Mark(layer, before.changed_at)
     return Mark(layer, layer.depth)
@@ -99,6 +107,8 @@ def layer_of(marks: Marks, path: Sequence[str], *, missing: bool = False) -> Lay
 
 def _layers(found: Any) -> list[Layer]:
     if isinstance(found, Mark):
+        return [found.layer]
+    if not found and isinstance(found, Given):
         return [found.layer]
     return [layer for each in found.values() for layer in _layers(each)]
 

@@ -219,3 +219,13 @@ def test_the_driver_of_a_device_is_no_part_of_its_keys(table):
     assert _is_tag(["loops", "right", table], "ensemble")
     assert not _is_tag(["loops", "right", table], "port")
     assert not _is_tag(["loops"], "ensemble")
+
+
+@pytest.mark.parametrize("table", ["loops.right", "camera", "loops.right.vernier"])
+def test_what_lacks_in_a_table_that_set_gives_is_an_error_of_set(table):
+    with pytest.raises(ConfigError) as raised:
+        load_rig(default_rig_path(), [f"{table}={{}}"])
+
+    lines = str(raised.value).splitlines()
+    assert lines
+    assert [line for line in lines if not line.startswith(f"--set: {table}.")] == []
