@@ -17,9 +17,9 @@ from fitctl.commands.shared.exits import FAILED, UNUSABLE
 from fitctl.commands.shared.log_time import time_ns
 from fitctl.commands.shared.logs import (
     LatestOption,
-    chosen_log,
-    chosen_logs,
+    log_alone,
     logging_rig,
+    logs_alone,
     say_left_out,
 )
 from fitctl.commands.shared.options import JsonOption, OverwriteOption, RigOption, SetOption
@@ -111,7 +111,7 @@ def info(
 
     With --json, prints one object a line for each log.
     """
-    for log in chosen_logs("log info", logs, rig, latest=latest):
+    for log in logs_alone("log info", logs, rig, latest=latest):
         found = log_info(log)
         if as_json:
             kept, recording = folder.is_kept(log), folder.in_use(log)
@@ -162,7 +162,7 @@ def summary(
     a log cannot be read; the others are summarised.
     """
     failed = False
-    for log in chosen_logs("log summary", logs, rig, latest=latest):
+    for log in logs_alone("log summary", logs, rig, latest=latest):
         line = _summary(log, most_bytes)
         unreadable = line.error not in {"", _TOO_LARGE}
         failed = failed or unreadable
@@ -240,7 +240,7 @@ def verify(
     if one cannot be read or is no log.
     """
     status, documents = 0, []
-    for log in chosen_logs("log verify", logs, rig, latest=latest):
+    for log in logs_alone("log verify", logs, rig, latest=latest):
         try:
             verdict = verifying.verify(log)
         except LogError as error:
@@ -280,7 +280,7 @@ def recover(
 
     LOG itself does not change.
     """
-    log = chosen_log("log recover", log, rig, latest=latest)
+    log = log_alone("log recover", log, rig, latest=latest)
     if folder.in_use(log):
         msg = f"{log}: is still being recorded; there is nothing to repair"
         raise ConfigError(msg)
@@ -330,7 +330,7 @@ def cut(
 
     UTC times look like 2026-11-21T09:18:30.5.
     """
-    log = chosen_log("log cut", log, rig, latest=latest)
+    log = log_alone("log cut", log, rig, latest=latest)
     found = log_info(log)
     if not found.counts:
         msg = f"cut: {log} has no record, so there is nothing to cut; name another log"
@@ -395,7 +395,7 @@ def export(
 
     The names of the columns have units.
     """
-    log = chosen_log("log export", log, rig, latest=latest)
+    log = log_alone("log export", log, rig, latest=latest)
     topics = _topics(log_info(log), topic)
     target = out or log.with_name(f"{log.stem}_{format_}")
     files = exporting.export(log, target, format_.value, topics)
@@ -420,7 +420,7 @@ def keep(
 
     Makes an empty file LOG.keep beside each log.
     """
-    for log in chosen_logs("log keep", logs, rig, latest=latest):
+    for log in logs_alone("log keep", logs, rig, latest=latest):
         folder.keep(log, kept=not undo)
         say(f"{log}: {'no longer kept' if undo else 'kept'}")
 

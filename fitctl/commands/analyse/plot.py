@@ -11,7 +11,7 @@ import typer
 
 from fitctl.commands.shared.exits import FAILED
 from fitctl.commands.shared.log_time import time_ns
-from fitctl.commands.shared.logs import LatestOption, chosen_logs
+from fitctl.commands.shared.logs import LatestOption, logs_alone
 from fitctl.commands.shared.options import RigOption
 from fitctl.commands.shared.printing import say
 from fitctl.config import ConfigError
@@ -63,7 +63,7 @@ def plot(
     if not what:
         msg = "plot: expected a topic or a field after the log, such as error_az_px"
         raise ConfigError(msg)
-    log = chosen_logs("plot", named, rig, latest=latest)[-1]
+    log = logs_alone("plot", named, rig, latest=latest)[-1]
     found = log_info(log)
     if not found.counts:
         msg = f"plot: {log} has no record, so there is nothing to plot; name another log"

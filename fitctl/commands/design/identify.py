@@ -28,6 +28,7 @@ from fitctl.identify.experiments import (
 )
 from fitctl.identify.fragments import fragment_text
 from fitctl.identify.run import Progress, on_rig, on_simulation, require_vernier
+from fitctl.logging.reading import logs_of_one_run_each
 from fitctl.messages.modes import Mode
 from fitctl.processes import ended_by_signals, interrupt
 
@@ -114,6 +115,8 @@ def identify(
         show_rig(settings.name, str(rig))
     if not step or loop not in settings.loops:
         require_loop("identify", settings, loop)
+    if log is not None and what != "response":  # which is from a file of the bench
+        logs_of_one_run_each([log])
     source = Source(log, simulated, mock, seed)
     by = f"fitctl identify {what}{' --simulate' * simulated}{' --mocks' * mock}"
     fragment_path = out or Path(f"{settings.name}-{loop}-{what}.toml")

@@ -63,6 +63,27 @@ def chosen_logs(
     return newest.files
 
 
+def logs_alone(
+    command: str, logs: Sequence[Path] | None, rig: Path | None, *, latest: bool
+) -> list[Path]:
+    """As :func:`chosen_logs`, for a command that uses a rig only to find its newest log.
+
+    Raises
+    ------
+    ConfigError
+        As there, or if there are a log and a rig.
+    """
+    if logs and rig is not None:
+        msg = f"{command}: --rig is for --latest; leave it out, or {logs[0]}"
+        raise ConfigError(msg)
+    return chosen_logs(command, logs, rig, latest=latest)
+
+
+def log_alone(command: str, log: Path | None, rig: Path | None, *, latest: bool) -> Path:
+    """As :func:`logs_alone`, for a command that reads one file: with ``--latest`` the newest."""
+    return logs_alone(command, None if log is None else [log], rig, latest=latest)[-1]
+
+
 def say_unreadable(problems: Iterable[str]) -> None:
     """Name the files that could not be read where the newest run was chosen, a line each."""
     for problem in problems:

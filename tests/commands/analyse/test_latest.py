@@ -10,6 +10,7 @@ from samples.log_samples import RUN_INFO, WALL_S, one_of_each, tick, write_log
 
 from fitctl.cli import main
 from fitctl.config import default_rig_path, load_rig
+from fitctl.logging.copying import merge
 from fitctl.logging.listing import newest_run
 from fitctl.report.run import find_run
 
@@ -243,3 +244,31 @@ def test_reports_and_designs_of_a_folder_name_what_cannot_be_read_in_it(fitctl, 
     for command in (("report", "logs"), ("design", "learn", "logs")):
         _, _, problems = fitctl(*command, "--rig", default_rig_path())
         assert problems.startswith("logs/torn.mcap: is not an MCAP log")
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        *(("log", one) for one in ("info", "verify", "summary", "recover", "cut", "keep")),
+        ("log", "export", "--format", "csv"),
+        ("plot",),
+    ],
+)
+def test_a_rig_beside_a_log_is_refused_where_it_would_say_nothing(fitctl, logs, command):
+    status, text, problem = fitctl(
+        *command, "logs/b.mcap", *["number"] * (command == ("plot",)), "--rig", default_rig_path()
+    )
+
+    assert (status, text) == (2, "")
+    assert (
+        problem == f"{' '.join(command[:2])}: --rig is for --latest; leave it out, or logs/b.mcap"
+    )
+
+
+def test_identify_refuses_a_log_of_several_runs(fitctl, logs):
+    merge([logs / "b.mcap", logs / "z.mcap"], logs / "both.mcap")
+
+    for what in ("spot", "airpath", "delay"):
+        status, _, problem = fitctl("identify", what, "--log", "logs/both.mcap")
+        assert status == 2
+        assert problem.startswith("logs/both.mcap: holds 2 runs")
