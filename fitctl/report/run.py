@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from fitctl.config import CONTROLLERS, Rig, is_name, rig_from_log
+from fitctl.config import CONTROLLERS, ConfigError, Rig, is_name, rig_from_log
 from fitctl.logging.errors import LogError
 from fitctl.logging.listing import find_newest, run_of
 from fitctl.logging.reading import LogInfo, logs_of_one_run_each
@@ -68,7 +69,7 @@ def find_run(paths: Sequence[Path], rig: Rig | None = None, overrides: Sequence[
         If there is no log, one cannot be read or is none of fitctl's, they are of several runs, or the newest
         run of the folder may be in a log that cannot be read.
     ConfigError
-        If the rig in the log is none that this fitctl understands.
+        If the rig in the log is none that this fitctl understands, or the given one has other loops or frames.
     """
     unreadable: tuple[str, ...] = ()
     if len(paths) == 1 and paths[0].is_dir():
@@ -87,6 +88,8 @@ def find_run(paths: Sequence[Path], rig: Rig | None = None, overrides: Sequence[
             raise LogError(msg)
     with_records = sorted((log for log in logs if log.counts), key=lambda log: log.start_s)
     logs = with_records or logs[:1]
+    if rig is not None:
+        _insist_on_loops(rig, logs[-1])
     return Run(
         logs=tuple(logs),
         rig=rig or _rig_of(logs[-1], overrides),
@@ -94,6 +97,33 @@ def find_run(paths: Sequence[Path], rig: Rig | None = None, overrides: Sequence[
         end_ns=round(max(log.end_s for log in logs) * 1e9) if with_records else 0,
         unreadable=unreadable,
     )
+
+
+NO_RIG = (ValueError, TypeError, KeyError, RecursionError)
+"""What :func:`unlike_the_log` raises where a log's text is no rig."""
+
+
+def unlike_the_log(rig: Rig, in_log: str) -> str:
+    """Why a rig cannot have recorded a log that has this one, as JSON; empty if it can."""
+    then = json.loads(in_log)
+    needed = (sorted(then["loops"]), then["camera"]["width_px"], then["camera"]["height_px"])
+    given = (sorted(rig.loops), rig.camera.width_px, rig.camera.height_px)
+    if given == needed:
+        return ""
+    return (
+        "loops, camera.width_px and camera.height_px must be those of the log, "
+        f"{needed}, are {given}"
+    )
+
+
+def _insist_on_loops(rig: Rig, log: LogInfo) -> None:
+    try:
+        unlike = unlike_the_log(rig, log.metadata["rig"]["json"])
+    except NO_RIG:  # the rig that is given stands in for it
+        return
+    if unlike:
+        msg = f"{log.path}: --rig {rig.name}: {unlike}; give the log's own rig file, or leave out --rig"
+        raise ConfigError(msg)
 
 
 def _identity(log: LogInfo) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from samples.log_samples import filled
 from samples.logged_simulation import designs_of
 from samples.report_samples import record
 
-from fitctl.config import ConfigError
+from fitctl.config import ConfigError, default_rig_path, load_rig
 from fitctl.daemon.run import run_info
 from fitctl.logging.copying import cut
 from fitctl.logging.errors import LogError
@@ -69,6 +69,16 @@ def test_values_of_the_logs_own_rig_can_be_replaced(halves, held, rig):
     assert run.rig.stellar_loops["right"].fsm == rig.stellar_loops["right"].fsm
     with pytest.raises(ConfigError, match=r"^--set: loops\.right\.fsm\.nonsense[^;]*$"):
         find_run([held[1]], overrides=["loops.right.fsm.nonsense=1"])
+
+
+def test_a_rig_file_of_other_loops_or_frames_is_refused(held, rig):
+    testbed = load_rig(default_rig_path().with_name("fit-testbed.toml"))
+    narrower = rig.model_copy(update={"camera": rig.camera.model_copy(update={"width_px": 39})})
+
+    assert find_run([held[1]], rig).rig is rig
+    for other in (testbed, narrower):
+        with pytest.raises(ConfigError, match=r"held\.mcap: --rig .*: loops, camera\.width_px and"):
+            find_run([held[1]], other)
 
 
 def test_a_folder_is_its_newest_run(halves, rig):

@@ -31,7 +31,7 @@ from fitctl.replay.replay import replay as replay_steps
 from fitctl.replay.result import LoopReplay, ReplayResult
 from fitctl.report.gather import Gathered, gather
 from fitctl.report.rejection import held_by_controller
-from fitctl.report.run import find_run
+from fitctl.report.run import NO_RIG, find_run, unlike_the_log
 from fitctl.text import plain
 
 _ROWS = {
@@ -44,6 +44,8 @@ _ROWS = {
     "tilt_arcsec": ("tilt between stars", "arcsec"),
     "visibility": ("visibility", ""),
 }
+_NOT_REPLAYED = {"plant", "mocks", "logging", "service"}
+"""Tables of a rig that neither its supervisor nor its loops read: a replay simulates and records nothing."""
 _OPEN_LOOP = (
     "open loop: today's commands do not change the frames, which are the log's; after each tick the stages are "
     "where\nthe log sent them; modes and the controllers' own state continue from today's"
@@ -71,6 +73,11 @@ def replay(
     last bit, or if you changed something with --controller, --set or --rig; 1 if they differ without; 2 if the
     log cannot be replayed.
     """
+    for override in overrides or ():
+        table = override.partition("=")[0].partition(".")[0].strip()
+        if table in _NOT_REPLAYED:
+            msg = f"replay: --set {override}: a replay uses nothing of the table {table}; leave it out"
+            raise ConfigError(msg)
     logs = chosen_logs("replay", logs, rig, latest=latest)
     with whole_run(logs) as info, logged_files(info) as files:
         settings = _rig(info, files, rig, overrides or [], controller)
@@ -199,20 +206,15 @@ def _rig(
     if controller is not None:
         rig = read([*overrides, *controller_overrides(rig.stellar_loops, controller)])
     try:
-        then = json.loads(in_log)
-        needed = (sorted(then["loops"]), then["camera"]["width_px"], then["camera"]["height_px"])
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        unlike = unlike_the_log(rig, in_log)
+    except NO_RIG as error:
         msg = (
             f"{origin}: is not as fitctl records it: {error!r}; expected JSON with tables loops and camera; "
             "name a log that fitctl recorded"
         )
         raise ConfigError(msg) from None
-    given = (sorted(rig.loops), rig.camera.width_px, rig.camera.height_px)
-    if given != needed:
-        msg = (
-            f"replay: loops, camera.width_px and camera.height_px must be those of the log, {needed}, are "
-            f"{given}; replace other values, or none"
-        )
+    if unlike:
+        msg = f"replay: {unlike}; replace other values, or none"
         raise ConfigError(msg)
     return rig
 

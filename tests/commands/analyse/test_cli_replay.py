@@ -173,6 +173,13 @@ UNUSABLE = {
     "a file that is none": (["no-such.mcap"], "no-such.mcap: cannot be opened"),
     "another camera": (["LOG", "--set", "camera.width_px=41"], "must be those of the log"),
     "a wrong key": (["LOG", "--set", "camera.with_px=41"], "camera.with_px: unknown key"),
+    **{
+        f"a key of {table}": (
+            ["LOG", "--set", f"{table}.any.key=1"],
+            f"replay: --set {table}.any.key=1: a replay uses nothing of the table {table}; leave it out",
+        )
+        for table in ("plant", "mocks", "logging", "service")
+    },
     "a controller that is none": (["LOG", "--controller", "pid"], "controller"),
     "a rig file that is none": (["LOG", "--rig", "no-such.toml"], "no-such.toml: no such rig file"),
     "no log at all": (["LOG", str(default_rig_path())], "is not an MCAP log"),
