@@ -8,9 +8,14 @@ from typing import Any
 
 import msgspec
 
+from fitctl.text import plain
+
 
 def write_page(path: Path, package: str, template: str, **values: Any) -> None:
     """Write a package's template, filled in; HTML is escaped, Markdown is not.
+
+    Of the characters that nobody can see, values keep their line breaks only: the others become visible, as
+    :func:`fitctl.text.plain` has them.
 
     Raises
     ------
@@ -23,11 +28,20 @@ def write_page(path: Path, package: str, template: str, **values: Any) -> None:
         loader=PackageLoader(package),
         autoescape=select_autoescape(["html.j2"]),
         undefined=StrictUndefined,
+        finalize=_visible,
         trim_blocks=True,
         keep_trailing_newline=True,
     )
     pages.filters["number"] = number
     path.write_text(pages.get_template(template).render(values), encoding="utf-8")
+
+
+def _visible(value: Any) -> Any:
+    if isinstance(value, str) and not hasattr(
+        value, "__html__"
+    ):  # which is a part of the page itself
+        return "\n".join(map(plain, value.split("\n")))
+    return value
 
 
 def number(value: float | None, form: str, unknown: str = "") -> str:

@@ -244,7 +244,7 @@ def test_the_figures_are_there_for_programs(made, findings):
 
 def test_a_run_with_nothing_in_it_makes_a_page_that_says_so(rig, tmp_path):
     path = tmp_path / "off.mcap"
-    evil = '<script>alert("x")</script>'
+    evil = '<script>alert("x")</script>\x1b[2J\u202e'
 
     def course(simulation):
         simulation.run(1.0)
@@ -259,7 +259,10 @@ def test_a_run_with_nothing_in_it_makes_a_page_that_says_so(rig, tmp_path):
 
     read = Reader(page)
     assert read.scripts == 0
-    assert evil in read.text
+    assert '<script>alert("x")</script>\\u001b[2J\\u202e' in read.text
+    assert [
+        character for line in page.splitlines() for character in line if not character.isprintable()
+    ] == []
     assert "not known" in page
     assert "none of" not in page
 
