@@ -15,6 +15,7 @@ Reading = tuple[float, float, str]
 
 _STRENGTH: dict[Action, int] = {"warn": 0, "freeze": 1, "flatten": 2, "safe": 3}
 _ROUNDING_S = 1e-9
+_MEASURED_BY = {"star": "the camera", "beam": "the photodiodes", "mirror": "camera and D/A"}
 
 
 class Change(NamedTuple):
@@ -63,14 +64,20 @@ class _Rule:
         value, time_s, note = reading or (math.nan, -math.inf, "")
         if note:
             return note  # an error of a device says all of this itself
+        quantity = QUANTITIES[self.quantity]
         age_s = now_s - max(time_s, self.active_since_s)
         if age_s > self.stale_s:
             what = f"no {self.quantity} for {age_s:.3g} s"
+            todo = "see whether the computer stood still"
+            if quantity.part != "computer":
+                device = _MEASURED_BY.get(quantity.part, f"the {quantity.part}")
+                todo = f"check power and link of {device}; {todo}"
         else:
             side = f"above {self.high:g}" if value > self.high else f"below {self.low:g}"
             out = "is not a number" if math.isnan(value) else f"{value:.4g} is {side}"
             what = f"{self.quantity} {out}" + (f" for {self.for_s:g} s" if self.for_s else "")
-        return f"interlock {self.name}: {self.place}: {what}; {QUANTITIES[self.quantity].remedy}"
+            todo = quantity.remedy
+        return f"interlock {self.name}: {self.place}: {what}; {todo}"
 
 
 class Interlocks:

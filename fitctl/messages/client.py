@@ -14,7 +14,7 @@ import msgspec
 import zmq
 
 from fitctl.config import ConfigError
-from fitctl.messages.commands import MAX_COMMAND_BYTES, AnyCommand, Reply, Stop
+from fitctl.messages.commands import MAX_COMMAND_BYTES, AnyCommand, Reply
 from fitctl.messages.endpoints import (
     COMMAND_SOCKET,
     TELEMETRY_SOCKET,
@@ -118,11 +118,11 @@ class Client:
             dealer.setsockopt(zmq.SNDTIMEO, timeout_ms)
             dealer.send_multipart([next(self._tags).to_bytes(8, "big"), payload])
             if not dealer.poll(timeout_ms):
-                raise ConnectionError(self._why_unanswered(command, timeout_s))
+                raise ConnectionError(self.why_silent(timeout_s))
             _, answer = dealer.recv_multipart()
         except zmq.Again:
             dealer.close()
-            raise ConnectionError(self._why_unanswered(command, timeout_s)) from None
+            raise ConnectionError(self.why_silent(timeout_s)) from None
         except BaseException:  # also Ctrl-C: a socket left open would hold up close()
             dealer.close()
             raise
@@ -208,13 +208,6 @@ class Client:
         if isinstance(self._where, RemoteKey):
             self._ahead_s.append(time_s - time.monotonic())
 
-    def _why_unanswered(self, command: AnyCommand, timeout_s: float) -> str:
-        why = self.why_silent(timeout_s)
-        may_move = self.folder is None or running_rig(self.folder) is not None
-        if isinstance(command, Stop) and may_move:
-            why += "; the instrument may still move: cut its power"
-        return why
-
     def why_silent(self, timeout_s: float) -> str:
         """Why nothing comes from the supervisor, and the next step."""
         where = self._where
@@ -222,8 +215,8 @@ class Client:
             running = running_rig(where.path)
             if running is not None:
                 return (
-                    f"the supervisor (process {running.pid}) runs, but did not answer within {timeout_s:g} s; if "
-                    f"it stays silent, end it with kill -KILL {running.pid}, and start it again"
+                    f"the supervisor (process {running.pid}) runs, but did not answer within {timeout_s:g} s; "
+                    f"if it stays silent, end it with kill -KILL {running.pid}, and start it again"
                 )
             return (
                 f"no supervisor answers at {where.path} within {timeout_s:g} s; start one with fitctl run and "

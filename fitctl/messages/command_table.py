@@ -31,7 +31,7 @@ class CommandRow(NamedTuple):
     word : str
         On a command line; empty for what programs alone send.
     key, label : str
-        In the console.
+        In the console; what has neither a label nor a word is sent by no person.
     question : str
         What the console asks first, where the command is laborious to undo.
     logged : bool
@@ -53,6 +53,11 @@ class CommandRow(NamedTuple):
     def name(self) -> str:
         """As ``LoopState.usable_commands`` calls it."""
         return self.make.__name__
+
+    @property
+    def title(self) -> str:
+        """What people call it."""
+        return self.word.capitalize() or self.label
 
     @property
     def fields(self) -> dict[str, bool]:
@@ -114,8 +119,8 @@ COMMANDS = (
     CommandRow(commands.RecentEvents, "any key", "events", logged=False),
     CommandRow(commands.TakeOver, "a commander's key", "take-over"),
     CommandRow(commands.Shutdown, "the instrument", "shutdown", wait_s=120.0),
-    CommandRow(commands.Experiment, "the instrument"),
-    CommandRow(commands.SequenceControl, "a commander's key"),
+    CommandRow(commands.Experiment, "the instrument", label="Experiment"),
+    CommandRow(commands.SequenceControl, "a commander's key", label="Sequence control"),
     CommandRow(commands.SequenceReport, "a commander's key", logged=False),
     CommandRow(commands.RecorderReport, "the Unix socket", logged=False),
     CommandRow(commands.LearnerReport, "the Unix socket"),

@@ -30,6 +30,7 @@ from fitctl.messages.commands import (
     Stop,
     TakeOver,
 )
+from fitctl.messages.modes import Mode
 from fitctl.messages.telemetry import Telemetry
 from fitctl.tui.alarms import AlarmBook
 from fitctl.tui.commands import BY_NAME, OPERATOR_COMMANDS, SCREENS, keys_of
@@ -58,6 +59,8 @@ from fitctl.tui.wire import UNREADABLE_NOTICE_S, NoLink, Wire
 BEAT_S = 0.1
 """How often something is drawn, if the machine allows; a panel says at which of these beats."""
 _NEVER_S = 1e9  # when Textual would let go of a notice by itself
+_STOPPED = frozenset({Mode.SAFE.name, Mode.OFF.name})
+_UNCONFIRMED_S = 20.0  # a notice of a command that may not have arrived
 KEEP_S = 4.0  # a console that is open keeps the lease of its user; less than the shortest lease
 
 
@@ -162,6 +165,7 @@ class ConsoleApp(App[None]):
         )
         self._beat = 0
         self._notice_s: dict[str, float] = {}  # of those that are not on the screen yet
+        self._stop_notice: Notification | None = None  # of a stop that was not confirmed
         self.pace = Pace()
         self._wire = Wire(
             link,
@@ -238,8 +242,22 @@ class ConsoleApp(App[None]):
         operator would not learn that a STOP is confirmed.
         """
         notice = Notification(message, title, severity, _NEVER_S, markup=markup)
-        self._notice_s[notice.identity] = self.NOTIFICATION_TIMEOUT if timeout is None else timeout
+        self._raise_notice(notice, self.NOTIFICATION_TIMEOUT if timeout is None else timeout)
+
+    def _raise_notice(self, notice: Notification, timeout: float) -> None:
+        self._notice_s[notice.identity] = timeout
         self.post_message(Notify(notice))
+
+    def _end_stop_notice(self) -> None:
+        """A stop that was not confirmed in time has been obeyed, as the telemetry shows."""
+        live, notice = self.playback.live, self._stop_notice
+        if notice is None or live.stale or live.newest is None:
+            return
+        if all(loop.mode in _STOPPED for loop in live.newest.loops):
+            self._stop_notice = None
+            self._notice_s.pop(notice.identity, None)
+            self._unnotify(notice)
+            self.notify("all loops are in SAFE or OFF", title="■ STOP was obeyed late", timeout=5)
 
     def _time_notices(self) -> None:
         """Begin to count the time of those that have come onto the screen."""
@@ -265,6 +283,7 @@ class ConsoleApp(App[None]):
         playback.live.now_s = self.clock()
         if not playback.log_name and playback.live_alarms.update(playback.live):
             self.bell()
+        self._end_stop_notice()
         for dialog in self.screen_stack[1:]:  # also those that Textual opens, such as the palette
             if dialog.is_attached and not dialog.query(StopKey):
                 dialog.mount(StopKey())
@@ -283,7 +302,7 @@ class ConsoleApp(App[None]):
             self.end_step()
         why_not = self.playback.why_not(command)
         if why_not:
-            title = f"▲ {type(command).__name__} is not sent"
+            title = f"▲ {ROWS[type(command)].title} is not sent"
             self.notify(why_not, title=title, severity="warning", timeout=6, markup=False)
             return
         loop = "" if isinstance(command, Stop | Shutdown) else self.state.shown
@@ -326,7 +345,7 @@ class ConsoleApp(App[None]):
 
     def _handle_reply(self, command: AnyCommand, reply: Reply | None, problem: str) -> None:
         """Show what became of a command, where that is not plain to see; without a reply, the problem."""
-        name = type(command).__name__
+        name, title = type(command).__name__, ROWS[type(command)].title
         if name == "Status":
             return  # which only keeps the instrument; a lost link is in the header
         if name == "RecentEvents":
@@ -338,13 +357,16 @@ class ConsoleApp(App[None]):
                 return
             if name == "Stop":
                 problem += "\nThe instrument may still move. Press STOP again, or cut its power."
-            self.notify(
-                problem, title=f"✗ {name} not confirmed", severity="error", timeout=20, markup=False
+            notice = Notification(
+                problem, f"✗ {title} not confirmed", "error", _NEVER_S, markup=False
             )
+            self._raise_notice(notice, _UNCONFIRMED_S)
+            if name == "Stop":
+                self._stop_notice = notice
         elif not reply.accepted:
             self.notify(
                 reply.text or "no reason given",
-                title=f"▲ {name} refused",
+                title=f"▲ {title} refused",
                 severity="warning",
                 timeout=8,
                 markup=False,

@@ -69,6 +69,26 @@ def test_a_stop_that_nobody_answers_or_that_fails_is_told_as_a_danger(error, tol
     run(scenario, link=FakeLink(fails))
 
 
+def test_the_danger_is_over_when_a_stop_that_was_not_confirmed_has_been_obeyed():
+    supervisor = FakeSupervisor()
+
+    def fails(_command):
+        raise ConnectionError("no answer in 1 s")
+
+    async def scenario(app, pilot, link):
+        await pilot.press("s")
+        await until(pilot, lambda: "may still move" in notifications(app))
+        link.deliver([supervisor.message()])
+        await pilot.pause(0.3)
+        assert "may still move" in notifications(app)
+        supervisor.mode = "SAFE"
+        link.deliver([supervisor.message()])
+        await until(pilot, lambda: "STOP was obeyed late" in notifications(app))
+        assert "may still move" not in notifications(app)
+
+    run(scenario, link=FakeLink(fails), supervisor=supervisor)
+
+
 def test_the_time_of_a_notice_counts_from_when_it_is_on_the_screen():
     async def scenario(app, pilot, link):
         with app.batch_update():  # nothing is drawn, as when other programs keep the processor busy

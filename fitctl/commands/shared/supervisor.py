@@ -17,10 +17,10 @@ from fitctl.commands.shared.rig import named_rig, rig_of
 from fitctl.config import ConfigError, Rig, default_rig_path
 from fitctl.messages.client import Client
 from fitctl.messages.command_table import ROWS
-from fitctl.messages.commands import AnyCommand, Reply, Shutdown
+from fitctl.messages.commands import AnyCommand, Reply, Shutdown, Stop
 from fitctl.messages.endpoints import service_folder
 from fitctl.messages.keys import read_key_of, read_remote
-from fitctl.messages.running import RunningRig, only_running_rig
+from fitctl.messages.running import RunningRig, only_running_rig, running_rig
 from fitctl.messages.telemetry import CommandOutcome
 from fitctl.messages.waiting import wait_for_end, wait_for_outcomes
 from fitctl.processes import ended_by_signals, interrupt
@@ -236,6 +236,9 @@ def _reply(client: Client, command: AnyCommand) -> Reply | ConnectionError:
     try:
         return client.send(command)
     except ConnectionError as error:
+        may_move = client.folder is None or running_rig(client.folder) is not None
+        if isinstance(command, Stop) and may_move:
+            return ConnectionError(f"{error}; the instrument may still move: cut its power")
         return error
 
 

@@ -71,6 +71,7 @@ class Mdt693:
         self._piezo = piezo
         self._endpoint = Endpoint("piezo amplifier", piezo.port)
         self._port: serial.Serial | None = None
+        self._link_error: DeviceUnreachable | None = None  # that has closed the port
         self._commands: Commands = MODEL_B
         self._echoes: bool | None = None  # not known yet
         self._in_step = False
@@ -143,7 +144,7 @@ class Mdt693:
     def close(self) -> None:
         """Let go of the port; safe to call twice and after a failure."""
         self._in_step = False
-        self._echoes = None
+        self._echoes = self._link_error = None
         if self._port is not None:
             self._port.close()
             self._port = None
@@ -282,17 +283,18 @@ class Mdt693:
 
     def _opened(self) -> serial.Serial:
         if self._port is None:
-            raise self._endpoint.not_open()
+            raise self._link_error or self._endpoint.not_open()
         return self._port
 
     def _broken(self, expected: str, error: OSError) -> NoReturn:
         self.close()
-        raise self._endpoint.error(
+        self._link_error = self._endpoint.error(
             DeviceUnreachable,
             expected,
             f"a broken link ({error})",
             "check its power and its cable, then recover",
-        ) from error
+        )
+        raise self._link_error from error
 
     def _silence(self, expected: str) -> NoReturn:
         raise self._endpoint.error(

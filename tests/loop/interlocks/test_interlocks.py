@@ -124,7 +124,7 @@ def test_a_value_that_grows_old_is_out_of_range_and_says_so():
     assert not course.show([None] * 10)
     (change,) = course.show([None])
 
-    assert "no fsm_range_fraction for 0.22 s" in change.trip.reason
+    assert "no fsm_range_fraction for 0.22 s; check power and link of " in change.trip.reason
 
 
 def test_a_value_that_was_never_measured_is_old_after_its_time_and_not_before():
