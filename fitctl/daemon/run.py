@@ -48,6 +48,7 @@ from fitctl.messages.endpoints import (
     make_service_folder,
     service_folder,
 )
+from fitctl.messages.modes import SHUTTING_DOWN
 from fitctl.messages.running import RUNNING_FILE, write_running
 from fitctl.processes import ended_by_signals, rig_arguments
 from fitctl.service.keyed_door import check_keyed_door
@@ -94,7 +95,8 @@ def check_log_folder(folder: Path) -> None:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except (OSError, ValueError) as error:
-        msg = f"logging.folder: {folder}: nothing can be written there: {error}; choose another"
+        reason = getattr(error, "strerror", None) or error
+        msg = f"logging.folder: {folder}: nothing can be written there: {reason}; choose another"
         raise ConfigError(msg) from None
 
 
@@ -216,7 +218,7 @@ def _children(
 ) -> list[Child]:
     """The recorder, and then what else the rig asks for."""
     beside = (
-        (True, "recorder", "record", "a new one begins a new file", PATIENCE_S),
+        (True, "recorder", "record", "a new recorder begins a new file", PATIENCE_S),
         (rig.service.metrics_port, "metrics server", "metrics", "a new one is started", PATIENCE_S),
         (
             rig.service.tcp_address,
@@ -298,7 +300,7 @@ def _loop(
                 tell_service_manager(ALIVE, status_line(supervisor.modes_of(supervisor.loops)))
         tell_service_manager(ENDING)
         supervisor.shutdown_wanted = True
-        supervisor.stop("shutting down")
+        supervisor.stop(SHUTTING_DOWN)
         end_s = clock.now_s() + _WIND_DOWN_S
         while clock.now_s() < end_s and not supervisor.at_rest():
             supervisor.step()

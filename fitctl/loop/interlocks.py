@@ -173,7 +173,7 @@ class Interlocks:
         """Reset a tripped interlock by hand; return the reason if it stays tripped."""
         rule = self._rules.get(name)
         if rule is None:
-            return f"no interlock is named {name}; there are {', '.join(self._rules)}"
+            return f"no interlock is named {name}; this loop has {', '.join(self._rules)}"
         if rule.trip is None:
             return f"interlock {name} is not tripped"
         reading = readings.get(rule.quantity)

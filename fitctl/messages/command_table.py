@@ -125,6 +125,7 @@ COMMANDS = (
     CommandRow(commands.RecorderReport, "the Unix socket", logged=False),
     CommandRow(commands.LearnerReport, "the Unix socket"),
 )
+_MOST_SHOWN = 40  # characters of a word that is no command
 _LOGGED_OF_REFUSED = 100  # characters of its loop, of its values and of the answer
 ROWS = {row.make: row for row in COMMANDS}
 RENAMED = {"hold": "release"}
@@ -144,17 +145,18 @@ def command_of(word: str, values: Sequence[str], loop: str, caller: str = "send"
         msg = f"{caller}: {word} is now {RENAMED[word]}"
         raise ConfigError(msg)
     if word not in WORDS:
-        msg = f"{caller}: unknown command {word!r}. Available: {', '.join(WORDS)}"
+        shown = word if len(word) <= _MOST_SHOWN else word[:_MOST_SHOWN] + "…"
+        msg = f"{caller}: unknown command {shown!r}. Available: {', '.join(WORDS)}"
         raise ConfigError(msg)
     row = WORDS[word]
     named = [text for text in values if "=" in text and text.partition("=")[0] in row.options]
     plain = [text for text in values if text not in named]
     if len(plain) != len(row.values):
-        needs = " ".join(row.values) or "no values"
+        takes = " ".join(map(str.upper, row.values)) or "no values"
         may = (
             f", and may have {', '.join(f'{name}=' for name in row.options)}" if row.options else ""
         )
-        msg = f"{caller}: {word} needs {needs}{may} (is {' '.join(values) or 'nothing'})"
+        msg = f"{caller}: {word} takes {takes}{may}; got {' '.join(values) or 'nothing'}"
         raise ConfigError(msg)
     options = dict(text.split("=", 1) for text in named)
     given = dict(zip(row.values, plain, strict=True)) | options | {"loop": loop}

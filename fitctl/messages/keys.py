@@ -153,8 +153,11 @@ def new_key(rig: Rig, name: str, role: Role, host: str, out: Path) -> RemoteKey:
     )
     try:
         msgspec.convert(msgspec.to_builtins(key), RemoteKey)
-    except msgspec.ValidationError as error:
-        msg = f"keys: {name!r} cannot be a name ({error}); use a-z, 0-9, - and _, at most 32"
+    except msgspec.ValidationError:
+        msg = (
+            f"keys: {name!r} cannot be a name; use a-z, 0-9, - and _, at most 32, and begin with a letter or "
+            "a digit"
+        )
         raise ConfigError(msg) from None
     allowed = _allowed_folder(rig) / f"{name}.toml"
     if _exists(allowed):
@@ -183,7 +186,7 @@ def revoke_key(rig: Rig, name: str) -> None:
     """
     known = [path.stem for path in _allowed_paths(rig)]
     if name not in known:
-        msg = f"keys: no key is named {name}; there are {', '.join(known) or 'none'}"
+        msg = f"keys: no key is named {name}; the rig has {', '.join(known) or 'none'}"
         raise ConfigError(msg)
     path = _allowed_folder(rig) / f"{name}.toml"
     try:
@@ -252,9 +255,7 @@ def read_key_of(rig: Rig, path: Path) -> RemoteKey:
     """
     key = read_remote(path)
     if key.rig != rig.name:
-        msg = (
-            f"{path}: is a key to rig {key.rig}, not {rig.name}; give the rig file of the key's rig"
-        )
+        msg = f"{path}: is a key to rig {key.rig}, not {rig.name}; give that rig's file with --rig"
         raise ConfigError(msg)
     return key
 

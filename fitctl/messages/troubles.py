@@ -301,7 +301,7 @@ def _of_recording(telemetry: Telemetry) -> Iterator[Trouble]:
         yield Trouble(
             "recorder",
             "warning",
-            f"the recorder has been silent for {silent_s:.0f} s",
+            f"nothing is being recorded: the recorder has been silent for {silent_s:.0f} s",
             heard_s,
             f"{go_on}, records wait for it",
             "see the events, and the disk of logging.folder",

@@ -16,6 +16,7 @@ import zmq.asyncio
 from pydantic import ValidationError
 
 from fitctl.config import ARCSEC_PER_RAD, Fault, Fringes
+from fitctl.config.base import must_be
 from fitctl.mocks.faults import Faults, UnknownFault, check_fault
 from fitctl.model.metrology.fringes import mean_visibility
 from fitctl.model.plant import Plant
@@ -196,7 +197,8 @@ class FaultTable:
             return FaultsNow([], str(error))
         except ValidationError as error:
             first = error.errors()[0]
-            return FaultsNow([], f"{'.'.join(map(str, first['loc']))}: {first['msg']}")
+            where = ".".join(map(str, first["loc"]))
+            return FaultsNow([], f"{where}: {must_be(first)} (is {first['input']})")
         active = [fault for faults in self._devices.values() for fault in faults.active]
         return FaultsNow([ActiveFault(**fault.model_dump(exclude={"at_s"})) for fault in active])
 

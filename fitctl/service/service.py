@@ -246,7 +246,7 @@ class Service(threading.Thread):
                 self._answer_here(waiting, command, Reply(accepted=True, text=text))
             case RecentEvents():
                 events = self._buffer.recent_events()
-                text = f"the last {len(events)} events"
+                text = f"the last {len(events)} events" if events else "no events yet"
                 reply = Reply(accepted=True, text=text, events=events)
                 self._answer_here(waiting, command, reply)
             case RecorderReport():

@@ -83,7 +83,9 @@ class SequenceBoard:
         ):
             self._journal.record(now.last_attempt)
         if before is None:
-            self._journal.event("info", _SOURCE, f"{now.name} begins, {now.steps} steps")
+            self._journal.event(
+                "info", _SOURCE, f"{now.name} begins, {now.steps} step{'s' * (now.steps != 1)}"
+            )
         elif before.state != now.state:
             severity: Severity = "warning" if now.state in {"failed", "stopped"} else "info"
             detail = f": {now.message}" if now.message else ""

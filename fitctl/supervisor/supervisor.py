@@ -417,7 +417,7 @@ class Supervisor:
             self._stop_collector()  # a start that came before the stop was obeyed only now
         names = self._named(command)
         if not names:
-            return _refusal(f"no loop is named {command.loop}; there are {', '.join(self.loops)}")
+            return _refusal(f"no loop is named {command.loop}; the rig has {', '.join(self.loops)}")
         if isinstance(command, Shutdown):
             self.shutdown_wanted = True
             return Reply(accepted=True, text="shutting down")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
+from fitctl.messages.modes import SHUTTING_DOWN
 from fitctl.messages.troubles import Trouble, troubles
 from fitctl.tui.state import ConsoleState
 
@@ -169,6 +170,17 @@ def _alarm(trouble: Trouble) -> Alarm:
 
 
 def _no_data(state: ConsoleState) -> Alarm:
+    changes = [loop.last_change for loop in state.newest.loops] if state.newest else []
+    if any(change is not None and change.reason == SHUTTING_DOWN for change in changes):
+        return Alarm(
+            "no data",
+            False,
+            f"the supervisor shut down; it was last heard {state.silent_s:.0f} s ago",
+            state.received_s,
+            "the console attaches to the next one by itself",
+            "start one with fitctl run",
+            latches=False,
+        )
     return Alarm(
         "no data",
         True,

@@ -17,6 +17,7 @@ MOST_BYTES = 200_000
 MOST_JSON_BYTES = 8_000_000
 _ASKS = ": "  # at the end of a question
 GENTLY = ("nice", "-n", "10")  # a rehearsal or a report takes no time from the instrument
+_SHORT = {("sequence", "list"), ("check",)}  # which a person waits for, and which are soon over
 
 
 class Job:
@@ -39,9 +40,17 @@ class Job:
         self.command_line = " ".join(["fitctl", *arguments])
         self.outlives, self.asks = outlives, asks
         self._output = tempfile.TemporaryFile()  # noqa: SIM115  # closed by end()
+        is_short = any(tuple(arguments[: len(words)]) == words for words in _SHORT)
         own = ["--console-pid", str(os.getpid())] if asks else []
         self._process = subprocess.Popen(
-            [*([] if self.moves else GENTLY), sys.executable, "-m", "fitctl", *arguments, *own],
+            [
+                *([] if self.moves or is_short else GENTLY),
+                sys.executable,
+                "-m",
+                "fitctl",
+                *arguments,
+                *own,
+            ],
             stdin=subprocess.PIPE if asks else subprocess.DEVNULL,
             stdout=self._output,
             stderr=subprocess.STDOUT,

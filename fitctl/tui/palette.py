@@ -43,9 +43,13 @@ class PlaceProvider(Provider):
             yield DiscoveryHit(f"{word} AZ EL", lambda: None, help=text)
 
     async def search(self, query: str) -> Hits:
-        """Match a complete place."""
+        """Match a complete place, or say what is missing."""
         found = parse_place(query)
         if found is not None:
             label, command = found
             console = cast("Console", self.app)
             yield Hit(1.0, label, partial(console.send, command), help=ROWS[type(command)].help)
+            return
+        word = query.partition(" ")[0].lower()
+        if word in _PLACES:
+            yield Hit(1.0, f"{word} takes AZ EL in px, such as: {word} 24 19.5", lambda: None)

@@ -65,13 +65,13 @@ def test_a_value_below_zero_is_no_option(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("word", "values", "complaint"),
     [
-        ("acquire", ["wide"], "needs no values, and may have search_radius_sky_arcsec="),
-        ("acquire", ["field_overlap"], "needs no values"),
+        ("acquire", ["wide"], "takes no values, and may have search_radius_sky_arcsec="),
+        ("acquire", ["field_overlap"], "takes no values"),
         ("acquire", ["field_overlap=much"], "field_overlap must be a number, got 'much'"),
         ("explode", [], "unknown command 'explode'. Available: stop, "),
-        ("target", ["1"], "needs az_px el_px"),
+        ("target", ["1"], "takes AZ_PX EL_PX; got 1"),
         ("target", ["far", "1"], "target far 1"),
-        ("stop", ["now"], "needs no values"),
+        ("stop", ["now"], "takes no values"),
         ("hold", [], "hold is now release"),
         (
             "controller",

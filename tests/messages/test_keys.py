@@ -152,7 +152,7 @@ def test_a_revoked_key_is_gone_and_may_be_made_anew(rig, tmp_path):
 def test_revoking_nobody_names_who_there_is(rig, tmp_path):
     new_key(rig, "anna", "commander", "", tmp_path / "anna.toml")
 
-    with pytest.raises(ConfigError, match="there are anna"):
+    with pytest.raises(ConfigError, match="the rig has anna"):
         revoke_key(rig, "../server")
 
 

@@ -199,6 +199,20 @@ def test_silence_of_the_supervisor_is_an_alarm_that_ends_with_it():
     assert watch.hear() == []
 
 
+def test_a_supervisor_that_shut_down_is_no_danger():
+    supervisor = FakeSupervisor("SAFE")
+    supervisor.trigger, supervisor.reason = "STOP", "shutting down"
+    watch = Watch(supervisor)
+    watch.hear()
+    watch.state.now_s += 7.0
+    watch.book.update(watch.state)
+
+    (alarm,) = watch.book.in_order
+
+    assert alarm.what == "the supervisor shut down; it was last heard 7 s ago"
+    assert not alarm.error
+
+
 def test_the_bell_rings_until_it_is_silenced_and_again_for_something_new():
     watch = Watch(FakeSupervisor())
     watch.supervisor.interlocks = [tripped()]

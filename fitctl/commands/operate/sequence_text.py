@@ -21,10 +21,16 @@ def where(status: SequenceStatus) -> str:
 
 
 def attempts_text(attempts: list[SequenceAttempt]) -> str:
-    """One line for each attempt, its times the instrument's; then a table of the stars, if there were any."""
-    head = f"{'step':>4}  {'':<11}  {'try':>3}  {'outcome':<9}  {'s':>7}"
+    """One line for each attempt, its times the instrument's; then a table of the stars, if there were any.
+
+    Where several loops had steps, each line names its loop.
+    """
+    loops = {each.loop for each in attempts}
+    columns = max(map(len, loops), default=0) + 2 if len(loops) > 1 else 0
+    head = f"{'step':>4}  {'':<11}  {'':<{columns}}{'try':>3}  {'outcome':<9}  {'s':>7}"
     lines = [
-        f"{each.step_number:>4}  {each.step:<11}  {each.attempt:>3}  {each.outcome:<9}  "
+        f"{each.step_number:>4}  {each.step:<11}  {each.loop if columns else '':<{columns}}"
+        f"{each.attempt:>3}  {each.outcome:<9}  "
         f"{each.ended_s - each.began_s:>7.1f}  {_of_star(each)}{each.message}".rstrip()
         for each in attempts
     ]

@@ -139,7 +139,7 @@ class BulkSlcanBus(slcanBus):
             except (OSError, ValueError) as error:
                 raise can.CanOperationError(str(error)) from error
             if not chunk:
-                msg = "the adapter closed the connection"
+                msg = "a connection that the adapter closed"
                 raise can.CanOperationError(msg)
             self._buffer += chunk
             has_read = True

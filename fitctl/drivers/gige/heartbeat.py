@@ -81,6 +81,6 @@ def _check_control(channel: Registers) -> None:
         raise channel.endpoint.error(
             DeviceUnreachable,
             "to keep control of the camera",
-            "the camera took it away",
-            "its heartbeat was not refreshed in time, or it restarted; open it again",
+            "a camera that has ended it",
+            "the camera restarted, or fitctl's heartbeat came too late; open it again",
         )

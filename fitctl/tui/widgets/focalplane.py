@@ -200,18 +200,23 @@ class FocalPlane(Panel):
         return found
 
     def _names(self, placing: Placing) -> Marks:
-        """The name of its loop at the upper left corner of each window, where there are several loops."""
+        """The name of its loop at the upper left corner of each window, where there are several loops.
+
+        A name that would lie on another is left out; the shown loop's comes first.
+        """
         if len(self.state.loops) < 2:
             return {}
         marks: Marks = {}
-        for name, loop in self.state.loops.items():
-            tick = loop.tick
+        for name in sorted(self.state.loops, key=lambda name: name != self.state.shown):
+            tick = self.state.loops[name].tick
             if tick is None or not tick.star_visible:
                 continue
             row = math.floor(placing.row(tick.window_el_px + WINDOW_PX / 2)) - 1
             column = math.floor(placing.column(tick.window_az_px - WINDOW_PX / 2))
             colour = GREEN if name == self.state.shown else INK
-            marks |= name_marks(name, column, row, colour, placing)
+            of_name = name_marks(name, column, row, colour, placing)
+            if not marks.keys() & of_name.keys():
+                marks |= of_name
         return marks
 
     def _caption(self, frame: FrameRecord, tick: Tick | None, columns: int) -> Line:

@@ -120,7 +120,7 @@ class Timing(Panel):
         unsent = sum(newest.losses.unsent.values())
         if rows < TABLE_FROM_ROWS:
             return [*_dense(loop.timing, unsent, newest.scheduling, columns), recorder]
-        table = _table(loop.timing, unsent)
+        table = _table(loop.timing, unsent, columns)
         notes = textwrap.wrap(newest.scheduling, columns)[: rows - len(table) - 1]
         return [*table, *([text(note, DIM)] for note in notes), recorder]
 
@@ -150,7 +150,7 @@ def _dense(timing: LoopTiming, unsent: int, scheduling: str, columns: int) -> li
     for name, median_s, worst_s in pairs:
         pair = [text(f"{name} ", DIM), text(f"{_short_ms(median_s)}/{_short_ms(worst_s)} ", INK)]
         times += pair if width(times) + width(pair) + 2 <= columns else []
-    counts = _counts(timing, unsent)
+    counts = _counts(timing, unsent, columns)
     room = columns - width(counts) - 1
     return [
         [*times, text("ms", DIM)],
@@ -158,7 +158,7 @@ def _dense(timing: LoopTiming, unsent: int, scheduling: str, columns: int) -> li
     ]
 
 
-def _table(timing: LoopTiming, unsent: int) -> list[Line]:
+def _table(timing: LoopTiming, unsent: int, columns: int) -> list[Line]:
     rows = (
         ("compute", timing.compute_median_s, timing.compute_worst_s),
         ("frame age", timing.frame_age_median_s, timing.frame_age_worst_s),
@@ -170,13 +170,15 @@ def _table(timing: LoopTiming, unsent: int) -> list[Line]:
             [text(f"{name:<12}", DIM), text(f"{_ms(median_s):>8}{_ms(worst_s):>8}", INK)]
             for name, median_s, worst_s in rows
         ),
-        _counts(timing, unsent),
+        _counts(timing, unsent, columns),
     ]
 
 
-def _counts(timing: LoopTiming, unsent: int) -> Line:
-    """What went wrong: in the last second; frames and what no console was sent since the start."""
-    line: Line = []
+def _counts(timing: LoopTiming, unsent: int, columns: int) -> Line:
+    """What went wrong: in the last second; frames and what no console was sent since the start.
+
+    Where there is no room for all counts, those that are 0 are left out.
+    """
     counts = [
         ("late", timing.late_ticks),
         ("lost", timing.frames_lost),
@@ -184,12 +186,16 @@ def _counts(timing: LoopTiming, unsent: int) -> Line:
         ("stall", timing.stalls),
     ]
     counts += [("unsent", unsent)] if unsent else []  # there is hardly room for it
-    for name, count in counts:
-        line += [
-            text(f"{name} ", DIM),
-            text(f"{count}{'!' if count else ''} ", ORANGE if count else INK, bold=count > 0),
-        ]
-    return line
+    pieces = [
+        [text(f"{name} ", DIM), text(f"{count}! ", ORANGE, bold=True) if count else text("0 ", INK)]
+        for name, count in counts
+    ]
+    line = [part for piece in pieces for part in piece]
+    if width(line) <= columns:
+        return line
+    return [
+        part for (_, count), piece in zip(counts, pieces, strict=True) if count for part in piece
+    ]
 
 
 def _ms(seconds: float) -> str:

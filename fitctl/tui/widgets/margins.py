@@ -173,7 +173,7 @@ def learning_lines(loop: LoopState, columns: int) -> list[Line]:
         gain = f"on frames {learning.measured_px:.4f} px, expected {learning.expected_px:.4f}"
     elif learning.state == "fell back":
         gain, colour = "returned to the previous design", ORANGE
-    lines = [[text("learning".ljust(_NAME_COLUMNS), DIM), text(gain, colour)]]
+    lines = _wrapped("learning", gain, colour, columns)
     if not math.isnan(learning.before_px):
         before = f"{learning.before_px:.4f} px on the same frames, computed"
         lines.append([text("before".ljust(_NAME_COLUMNS), DIM), text(before, INK)])

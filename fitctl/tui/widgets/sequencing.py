@@ -170,7 +170,7 @@ class Parameters(Choice):
             if row.key:
                 value = row.value if row.value != "" else "the only loop"
                 lines.append(
-                    [text(f"   {row.key:<{24}}", DIM), text(shorten(str(value), columns - 28), INK)]
+                    [text(f"   {row.key:<26}", DIM), text(shorten(str(value), columns - 30), INK)]
                 )
             else:
                 lasts = f"  {steps_s[row.step]:.0f} s" if row.step < len(steps_s) else ""

@@ -73,7 +73,7 @@ def test_a_recorder_that_has_not_reported_yet_is_no_trouble_until_it_has_been_si
 
     assert after(0.9 * RECORDER_SILENT_S) == []
     (line,) = after(1.1 * RECORDER_SILENT_S)
-    assert "the recorder has been silent for 11 s" in line
+    assert "nothing is being recorded: the recorder has been silent for 11 s" in line
 
 
 @pytest.mark.parametrize("mode", ["OFF", "STANDBY", "VERNIER"])

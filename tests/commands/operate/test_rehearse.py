@@ -40,7 +40,7 @@ def test_a_refusal_is_foreseen(served, fitctl):
 def test_a_mistake_is_named_before_anything_is_simulated(fitctl):
     status, _, err = fitctl("rehearse", "target", "22")
     assert status == 2
-    assert "target needs AZ_PX EL_PX" in err or "needs" in err
+    assert "target takes AZ_PX EL_PX" in err
 
 
 @pytest.mark.long

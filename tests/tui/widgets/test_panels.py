@@ -216,6 +216,20 @@ def test_what_no_console_was_sent_stands_beside_the_other_counts(rows):
     assert "unsent 12!" in " ".join(plain(Timing(shown(supervisor)).draw(60, rows)))
 
 
+@pytest.mark.parametrize("rows", [3, 9])
+def test_where_there_is_no_room_for_all_counts_those_that_are_not_zero_are_whole(rows):
+    supervisor = FakeSupervisor()
+    state = shown(supervisor)
+    loop = state.loops["right"]
+    loop.timing = msgspec.structs.replace(loop.timing, late_ticks=5, servo_missed=13, stalls=1234)
+    printed = " ".join(plain(Timing(state).draw(39, rows)))
+    for count in ("late 5!", "miss 13!", "stall 1234!"):
+        assert count in printed
+    printed = " ".join(plain(Timing(state).draw(29, rows)))
+    assert "stall 1234!" in printed
+    assert "lost 0" not in printed
+
+
 def test_a_long_name_of_the_commander_gives_way_to_the_state_of_the_link():
     supervisor = FakeSupervisor()
     message = supervisor.messages(1)[-1]
