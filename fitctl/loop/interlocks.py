@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from fitctl.config import QUANTITIES, Action, Interlock
+from fitctl.config.interlocks import Quantity
 from fitctl.messages.telemetry import TrippedInterlock, Watched
 
 Reading = tuple[float, float, str]
@@ -15,7 +16,6 @@ Reading = tuple[float, float, str]
 
 _STRENGTH: dict[Action, int] = {"warn": 0, "freeze": 1, "flatten": 2, "safe": 3}
 _ROUNDING_S = 1e-9
-_MEASURED_BY = {"star": "the camera", "beam": "the photodiodes", "mirror": "camera and D/A"}
 
 
 class Change(NamedTuple):
@@ -68,16 +68,23 @@ class _Rule:
         age_s = now_s - max(time_s, self.active_since_s)
         if age_s > self.stale_s:
             what = f"no {self.quantity} for {age_s:.3g} s"
-            todo = "see whether the computer stood still"
-            if quantity.part != "computer":
-                device = _MEASURED_BY.get(quantity.part, f"the {quantity.part}")
-                todo = f"check power and link of {device}; {todo}"
+            todo = _remedy_of_missing(quantity)
         else:
             side = f"above {self.high:g}" if value > self.high else f"below {self.low:g}"
             out = "is not a number" if math.isnan(value) else f"{value:.4g} is {side}"
             what = f"{self.quantity} {out}" + (f" for {self.for_s:g} s" if self.for_s else "")
             todo = quantity.remedy
         return f"interlock {self.name}: {self.place}: {what}; {todo}"
+
+
+def _remedy_of_missing(quantity: Quantity) -> str:
+    """What to do where no reading comes."""
+    if quantity.part in {"star", "beam"}:  # one that is not there has no reading either
+        return quantity.remedy
+    stalled = "see whether the computer stood still"
+    if quantity.part == "computer":
+        return stalled
+    return f"check power and link of the {quantity.part}; {stalled}"
 
 
 class Interlocks:

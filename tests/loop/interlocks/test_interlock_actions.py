@@ -146,7 +146,7 @@ def test_a_reset_is_refused_by_name():
     reply = bench.simulation.command(Reset(name="moon"))
 
     assert not reply.accepted
-    assert "there are star_lost" in reply.text
+    assert "this loop has star_lost" in reply.text
 
 
 def test_hold_by_command_is_no_interlock():

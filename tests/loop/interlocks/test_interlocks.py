@@ -124,7 +124,18 @@ def test_a_value_that_grows_old_is_out_of_range_and_says_so():
     assert not course.show([None] * 10)
     (change,) = course.show([None])
 
-    assert "no fsm_range_fraction for 0.22 s; check power and link of " in change.trip.reason
+    assert (
+        "no fsm_range_fraction for 0.22 s; check power and link of the mirror" in change.trip.reason
+    )
+
+
+def test_a_star_that_no_frame_shows_is_no_matter_of_a_link():
+    rows = {"it": row(quantity="star_flux_fraction", high=None, stale_s=0.2, for_s=0.0)}
+    course = Course(Interlocks(rows, {"star": "star of right"}))
+    course.show([0.5], quantity="star_flux_fraction")
+    (change,) = course.show([None] * 11, quantity="star_flux_fraction")
+
+    assert change.trip.reason.endswith(QUANTITIES["star_flux_fraction"].remedy)
 
 
 def test_a_value_that_was_never_measured_is_old_after_its_time_and_not_before():
@@ -188,7 +199,7 @@ def test_a_reset_is_refused_while_the_value_is_out_of_range_and_says_how_far():
     assert course.tripped == ["it"]
 
 
-@pytest.mark.parametrize(("name", "said"), [("it", "is not tripped"), ("that", "there are it")])
+@pytest.mark.parametrize(("name", "said"), [("it", "is not tripped"), ("that", "this loop has it")])
 def test_what_is_not_tripped_or_not_there_cannot_be_reset(name, said):
     assert said in table().reset(name, 0.0, {})
 
