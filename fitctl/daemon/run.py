@@ -48,7 +48,6 @@ from fitctl.messages.endpoints import (
     make_service_folder,
     service_folder,
 )
-from fitctl.messages.modes import SHUTTING_DOWN
 from fitctl.messages.running import RUNNING_FILE, write_running
 from fitctl.processes import ended_by_signals, rig_arguments
 from fitctl.service.keyed_door import check_keyed_door
@@ -300,7 +299,7 @@ def _loop(
                 tell_service_manager(ALIVE, status_line(supervisor.modes_of(supervisor.loops)))
         tell_service_manager(ENDING)
         supervisor.shutdown_wanted = True
-        supervisor.stop(SHUTTING_DOWN)
+        supervisor.stop("shutting down")
         end_s = clock.now_s() + _WIND_DOWN_S
         while clock.now_s() < end_s and not supervisor.at_rest():
             supervisor.step()

@@ -10,8 +10,6 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
 
-SHUTTING_DOWN = "shutting down"
-"""The reason of a change of mode by a supervisor that ends."""
 OPERATOR = "operator"
 """The reason of a change of mode or design that a command asked for."""
 

@@ -237,6 +237,7 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     ``sequence`` counts the messages: a gap in it are those that this console was too slow for.
     ``recorder`` is what the recorder reported last, None before its first report; ``recorder_started_s`` is
     when the one that runs now was started, None if none runs.
+    ``shutting_down`` is set from when the supervisor begins to end.
     """
 
     version: int = PROTOCOL_VERSION
@@ -264,6 +265,7 @@ class Telemetry(msgspec.Struct, frozen=True, kw_only=True):
     stopped_by: str = ""
     fringes: FringeOptics | None = None
     recorder_started_s: float | None = None
+    shutting_down: bool = False
 
     @property
     def recorder_awaited(self) -> bool:

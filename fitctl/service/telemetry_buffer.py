@@ -136,6 +136,7 @@ class TelemetryBuffer:
             stopped_by=self.stopped_by,
             fringes=_fringe_optics(supervisor.rig),
             recorder_started_s=state.recorder_started_s(),
+            shutting_down=supervisor.shutdown_wanted,
         )
 
     def recent_events(self) -> list[Event]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
-from fitctl.messages.modes import SHUTTING_DOWN
 from fitctl.messages.troubles import Trouble, troubles
 from fitctl.tui.state import ConsoleState
 
@@ -170,8 +169,7 @@ def _alarm(trouble: Trouble) -> Alarm:
 
 
 def _no_data(state: ConsoleState) -> Alarm:
-    changes = [loop.last_change for loop in state.newest.loops] if state.newest else []
-    if any(change is not None and change.reason == SHUTTING_DOWN for change in changes):
+    if state.newest is not None and state.newest.shutting_down:
         return Alarm(
             "no data",
             False,

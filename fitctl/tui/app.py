@@ -257,7 +257,7 @@ class ConsoleApp(App[None]):
             self._stop_notice = None
             self._notice_s.pop(notice.identity, None)
             self._unnotify(notice)
-            self.notify("all loops are in SAFE or OFF", title="■ STOP was obeyed late", timeout=5)
+            self.notify("all loops are in SAFE or OFF", title="■ the loops have stopped", timeout=5)
 
     def _time_notices(self) -> None:
         """Begin to count the time of those that have come onto the screen."""

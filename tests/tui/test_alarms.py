@@ -200,11 +200,11 @@ def test_silence_of_the_supervisor_is_an_alarm_that_ends_with_it():
 
 
 def test_a_supervisor_that_shut_down_is_no_danger():
-    supervisor = FakeSupervisor("SAFE")
-    supervisor.trigger, supervisor.reason = "STOP", "shutting down"
-    watch = Watch(supervisor)
-    watch.hear()
-    watch.state.now_s += 7.0
+    watch = Watch(FakeSupervisor("SAFE"))
+    (message,) = watch.supervisor.messages(1)
+    last = msgspec.structs.replace(message, shutting_down=True)
+    watch.state.accept(last, last.time_s)
+    watch.state.now_s = last.time_s + 7.0
     watch.book.update(watch.state)
 
     (alarm,) = watch.book.in_order

@@ -83,7 +83,7 @@ def test_the_danger_is_over_when_a_stop_that_was_not_confirmed_has_been_obeyed()
         assert "may still move" in notifications(app)
         supervisor.mode = "SAFE"
         link.deliver([supervisor.message()])
-        await until(pilot, lambda: "STOP was obeyed late" in notifications(app))
+        await until(pilot, lambda: "the loops have stopped" in notifications(app))
         assert "may still move" not in notifications(app)
 
     run(scenario, link=FakeLink(fails), supervisor=supervisor)
