@@ -115,13 +115,12 @@ class Camera(Settings):
         az, el = self.largest_window_px
         return HALF_WINDOW_PX <= az_px <= az and HALF_WINDOW_PX <= el_px <= el
 
-    @property
-    def window_range_text(self) -> str:
-        """Where the window fits, for people."""
+    def no_window_text(self, az_px: float, el_px: float) -> str:
+        """Where the window fits, for people who want it about another place."""
         az, el = self.largest_window_px
         return (
             f"must lie in {HALF_WINDOW_PX}..{az} px az and {HALF_WINDOW_PX}..{el} px el, "
-            "so that the 7x7 window fits on the frame"
+            f"so that the 7x7 window fits on the frame (is {az_px:g}, {el_px:g})"
         )
 
     @model_validator(mode="after")

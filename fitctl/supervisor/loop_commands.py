@@ -39,7 +39,7 @@ def set_target(rig: Rig, loops: StellarLoops, command: SetTarget) -> str:
     ):  # two stars on one place are lost, and searched for and lost again and again
         return f"one loop has a target; name it: {', '.join(loop.name for loop in loops)}"
     if not rig.camera.window_fits(command.az_px, command.el_px):
-        return f"target {rig.camera.window_range_text}"
+        return f"target {rig.camera.no_window_text(command.az_px, command.el_px)}"
     for loop in loops:
         loop.target_px = np.array([command.az_px, command.el_px])
     return ""
@@ -53,7 +53,7 @@ def look(rig: Rig, loops: StellarLoops, command: Look) -> str:
     if loop.mode not in WITH_WINDOW:
         return f"look is not available in {loop.mode.name}; it needs COARSE or VERNIER"
     if not rig.camera.window_fits(command.az_px, command.el_px):
-        return f"look {rig.camera.window_range_text}"
+        return f"look {rig.camera.no_window_text(command.az_px, command.el_px)}"
     loop.star_finder.look_at_px = (command.az_px, command.el_px)
     return ""
 

@@ -249,7 +249,7 @@ class ConsoleApp(App[None]):
         self.post_message(Notify(notice))
 
     def _end_stop_notice(self) -> None:
-        """A stop that was not confirmed in time has been obeyed, as the telemetry shows."""
+        """A stop was not confirmed in time, but the telemetry shows all loops in SAFE or OFF."""
         live, notice = self.playback.live, self._stop_notice
         if notice is None or live.stale or live.newest is None:
             return

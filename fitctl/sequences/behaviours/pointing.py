@@ -144,11 +144,10 @@ def _grid(step: steps.Raster) -> list[Offset]:
 def _check_visit(step: steps.Visiting, rig: Rig, loop_name: str) -> list[str]:
     target, offsets = rig.stellar_loops[loop_name].target_px, places(step)
     problems = too_far(step, rig, loop_name, max(math.hypot(*offset) for offset in offsets))
-    if not all(
-        rig.camera.window_fits(target.az + offset.az_px, target.el + offset.el_px)
-        for offset in offsets
-    ):
-        problems.append(f"a place is off the frame: the star {rig.camera.window_range_text}")
+    places_px = [(target.az + offset.az_px, target.el + offset.el_px) for offset in offsets]
+    off_px = next((place for place in places_px if not rig.camera.window_fits(*place)), None)
+    if off_px is not None:
+        problems.append(f"a place is off the frame: the star {rig.camera.no_window_text(*off_px)}")
     if step.steady_after_s >= step.dwell_s:
         problems.append(f"steady_after_s must be below dwell_s, {step.dwell_s:g} s")
     return problems
