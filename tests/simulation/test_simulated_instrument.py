@@ -266,7 +266,7 @@ def test_a_command_for_an_unknown_loop_is_refused_by_name(vernier):
     reply = vernier.command(Stop(loop="left"))
 
     assert not reply.accepted
-    assert "there are right" in reply.text
+    assert "the rig has right" in reply.text
     assert mode_of(vernier) is Mode.VERNIER
 
 

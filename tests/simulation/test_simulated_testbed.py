@@ -146,7 +146,7 @@ def test_the_hexapod_goes_nowhere_before_it_is_referenced_or_beyond_its_travel()
         hexapod.move_to(Pose(y_mm=1.0), 8.0)
     hexapod.reference()
     hexapod.move_to(Pose(y_mm=1.0), 8.0)
-    with pytest.raises(DeviceRefused, match=r"expected y_mm within -50 to 50, got 51"):
+    with pytest.raises(DeviceRefused, match=r"expected y_mm within -50 and 50, got 51"):
         hexapod.move_to(Pose(y_mm=51.0), 8.0)
 
 

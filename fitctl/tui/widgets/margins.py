@@ -176,7 +176,7 @@ def learning_lines(loop: LoopState, columns: int) -> list[Line]:
     lines = _wrapped("learning", gain, colour, columns)
     if not math.isnan(learning.before_px):
         before = f"{learning.before_px:.4f} px on the same frames, computed"
-        lines.append([text("before".ljust(_NAME_COLUMNS), DIM), text(before, INK)])
+        lines += _wrapped("before", before, INK, columns)
     if learning.state == "advice":
         command = f"fitctl send controller learnt --loop {loop.name}"
         lines += _wrapped("to apply", command, INK, columns)
