@@ -51,7 +51,7 @@ def test_a_key_is_made_listed_and_revoked(settings, tmp_path, capsys):
     ("arguments", "complaint"),
     [
         (["keys", "new", "../anna"], "cannot be a name"),
-        (["keys", "revoke", "anna"], "no key is named anna; there are none"),
+        (["keys", "revoke", "anna"], "no key is named anna; the rig has none"),
         (["send", "status", "--remote", "none.toml"], "none.toml: cannot be read"),
         (["keys", "new", "anna", "--set", "service.tcp_address=rig"], "service.tcp_address"),
     ],

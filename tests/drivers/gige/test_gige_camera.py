@@ -237,7 +237,7 @@ def test_control_taken_away_is_noticed(serve: Serve, connect: Connect) -> None:
     camera = connect(served)
     camera.start()
     served.call(served.mock._release_control)
-    with pytest.raises(DeviceUnreachable, match="the camera took it away"):
+    with pytest.raises(DeviceUnreachable, match="a camera that has ended it"):
         drain(camera)
 
 

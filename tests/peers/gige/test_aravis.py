@@ -209,7 +209,7 @@ def test_the_back_end_counts_what_is_lost() -> None:
     ("fault", "said"),
     [
         ({"kind": "freeze", "at_s": 4.0}, "to be readable"),
-        ({"kind": "reboot", "at_s": 4.0, "value": 0.2}, "took it away"),
+        ({"kind": "reboot", "at_s": 4.0, "value": 0.2}, "a camera that has ended it"),
     ],
 )
 def test_the_back_end_notices_that_the_camera_is_lost(fault: dict, said: str) -> None:
