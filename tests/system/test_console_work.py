@@ -96,7 +96,7 @@ def test_a_sequence_is_run_steered_edited_and_rehearsed_and_its_log_reported_and
     logs.until("mcap kept")
     rig.client.send(Shutdown())
     assert rig.supervisor.wait(LIMIT_S) == 0
-    logs.until("NO DATA")
+    logs.until("the supervisor shut down")
     logs.press("t")
     logs.until("report.html", limit_s=2 * LIMIT_S)
     logs.press("y")
