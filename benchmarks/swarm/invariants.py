@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from benchmarks.swarm.devices.amplifiers import SwarmAmplifiers
 from benchmarks.swarm.devices.hexapod import SwarmHexapod
 from benchmarks.swarm.lines import WRONG_S, Line
-from benchmarks.swarm.motion import AT_REST, STUCK_S, WELL_S, Motion
+from benchmarks.swarm.motion import STUCK_S, WELL_S, Motion
 from benchmarks.swarm.own_stars import OwnStars, turned_by
 from benchmarks.swarm.zeros import Zeros
 from fitctl.clock import Clock
@@ -46,7 +46,7 @@ from fitctl.messages.commands import (
     Standby,
     Stop,
 )
-from fitctl.messages.modes import OPERATOR, Mode, Trigger
+from fitctl.messages.modes import AT_REST, OPERATOR, Mode, Trigger
 from fitctl.model.drives import experiment_s
 from fitctl.model.plant import Plant
 from fitctl.service.admission import Sender

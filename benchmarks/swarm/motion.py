@@ -15,7 +15,7 @@ from fitctl.clock import Clock
 from fitctl.config import Rig
 from fitctl.drivers.interface import AzEl, Pose
 from fitctl.loop.loop import Loop
-from fitctl.messages.modes import Mode
+from fitctl.messages.modes import AT_REST, Mode
 from fitctl.model.plant import Plant
 from fitctl.supervisor.supervisor import Supervisor
 
@@ -26,11 +26,10 @@ _MIRROR_RESTS_S = 1.0  # beyond the time that a mirror takes through its whole r
 WELL_S = 2.0  # after a fault, a line is taken to be well
 _DECIDED_S = 0.001  # no later than this after its decision a write is sent, on a line that is well
 _MOST_COUNTS = 5.0  # of the encoder: a siderostat that stands still moves no farther
-_SLOWLY = frozenset({Mode.OFF, Mode.SAFE, Mode.STANDBY})
+_SLOWLY = AT_REST | {Mode.STANDBY}
 _STILL: AzEl = (0.0, 0.0)
 _SLACK = 1.0 + 1e-6
 STUCK_S = 1.0  # for so long after motors were stuck, a servo may still be behind its reference
-AT_REST = frozenset({Mode.OFF, Mode.SAFE})
 
 
 class Motion:

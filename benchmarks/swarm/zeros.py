@@ -34,7 +34,7 @@ class Zeros:
         self._clock = clock
         self._lines = lines
         self._violated = violated
-        self._lost_rad: dict[str, float] = {}  # by loop: nobody has read the encoders since
+        self._lost_rad: dict[str, float] = {}  # by loop, until an opening reads the encoders
         self._read_rad: dict[str, float] = {}  # by loop: read, in an opening that goes on
         self._noticed_s: dict[str, float] = {}
         self._misread: set[str] = set()  # loops whose encoders may have been read wrongly

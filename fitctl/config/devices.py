@@ -35,7 +35,7 @@ from fitctl.config.conflict import Conflict, Conflicts, Part, at_least, at_most
 from fitctl.config.wiring import AmplifierWiring, Channels
 
 HALF_WINDOW_PX = 3  # of Eq. 7's 7x7 window, about its central pixel
-WINDOW_PX = 2 * HALF_WINDOW_PX + 1
+WINDOW_PX = 2 * HALF_WINDOW_PX + 1  # its side; a tick names its central pixel
 FULL_SCALE_DN = {"Mono8": 255, "Mono12": 4095, "Mono16": 65535}
 AIN_RANGES_V = (10.0, 1.0, 0.1, 0.01)  # of a LabJack T7's inputs, either way from zero
 PIEZO_LIMITS_V = (75.5, 100.5, 150.5)  # that an MDT693's limit switch reads at 75, 100 and 150 V

@@ -14,8 +14,7 @@ from fitctl.text import plain
 def write_page(path: Path, package: str, template: str, **values: Any) -> None:
     """Write a package's template, filled in; HTML is escaped, Markdown is not.
 
-    Of the characters that nobody can see, values keep their line breaks only: the others become visible, as
-    :func:`fitctl.text.plain` has them.
+    Line breaks in values stay; :func:`fitctl.text.plain` makes other invisible characters visible.
 
     Raises
     ------
@@ -37,9 +36,8 @@ def write_page(path: Path, package: str, template: str, **values: Any) -> None:
 
 
 def _visible(value: Any) -> Any:
-    if isinstance(value, str) and not hasattr(
-        value, "__html__"
-    ):  # which is a part of the page itself
+    is_part_of_page = hasattr(value, "__html__")
+    if isinstance(value, str) and not is_part_of_page:
         return "\n".join(map(plain, value.split("\n")))
     return value
 

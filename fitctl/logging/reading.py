@@ -31,7 +31,7 @@ from fitctl.logging.indexed import IndexedReader
 from fitctl.logging.records import MOST, Tick
 from fitctl.logging.schemas import TOPICS
 
-_CLOCK_SET_S = 86_400.0  # by more, nobody sets the clock of a machine that records
+_CLOCK_SET_S = 86_400.0  # someone may set the machine's clock by so much during a run
 # By column: how it is gathered (a type code of the array module; texts in a list) and what it becomes.
 _Form = dict[str, tuple[str, Any]]
 _COLUMNS: dict[int, tuple[str, Any]] = {

@@ -22,6 +22,7 @@ from fitctl.loop.interlocks import Interlocks
 from fitctl.loop.quantities import Quantities
 from fitctl.messages.commands import Acquire, AnyCommand
 from fitctl.messages.modes import (
+    AT_REST,
     OPERATOR,
     TRANSITIONS,
     Mode,
@@ -267,7 +268,7 @@ class Loop(ABC):
 
     def _enter(self, source: Mode, motor_rad: Floats) -> None:
         """Do what a change from `source` to the mode needs, with the motors at `motor_rad`, shape (2,)."""
-        if self.mode in {Mode.SAFE, Mode.OFF}:  # in OFF, before the amplifiers lose their power
+        if self.mode in AT_REST:  # in OFF, before the amplifiers lose their power
             self.servo.stop()
         elif self.mode is Mode.STANDBY:
             self.siderostat.hold(motor_rad)

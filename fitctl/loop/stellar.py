@@ -132,12 +132,9 @@ class StellarLoop(Loop):
             motor_rad = self.servo.position_at(frame.mid_exposure_s)
             mirror_rad = self.mirror.at(frame.mid_exposure_s)
         time_s = begun_s if frame is None else frame.mid_exposure_s
-        self.star_motion.read_at(time_s)
-        link, sky, link_rad = (
-            self.star_motion.link,
-            self.star_motion.sky,
-            self.star_motion.turned_rad,
-        )
+        motion = self.star_motion
+        motion.read_at(time_s)
+        link, sky, link_rad = motion.link, motion.sky, motion.turned_rad
         if frame is not None:
             beam_rad = motor_rad if link_rad is None else motor_rad + link_rad
             star = self._find(frame, mirror_rad, motor_rad, beam_rad)

@@ -54,6 +54,9 @@ KIND_MODES = {
 }
 """Modes by kind of loop, as the rig file names both."""
 
+AT_REST = frozenset({Mode.OFF, Mode.SAFE})
+"""The loop points at nothing, and its motors stand still."""
+
 FOLLOWING = frozenset({Mode.COARSE, Mode.VERNIER, Mode.EXPERIMENT})
 """The star is known, and looked for where it should be."""
 

@@ -196,9 +196,10 @@ def gather(run: Run) -> Gathered:
     fields: dict[str, Any] = {topic: wanted for topic, (_, wanted) in series.items()}
     fields[TOPICS[RecorderStatus]] = list(_FIELDS["recorder"])
     misdated = 0
+    between_s = own_times_s(run.logs[-1], run.start_ns / 1e9, run.end_ns / 1e9)
     for log in run.logs:
         for topic, block in column_blocks(log.path, [*series, *places], _ROWS, fields):
-            columns, left_out = _of_the_run(run, block)
+            columns, left_out = _of_the_run(between_s, block)
             misdated += left_out
             time_s = (columns["publish_time_ns"] - run.start_ns) / 1e9
             if topic in series:
@@ -244,9 +245,9 @@ def _series(run: Run) -> dict[str, tuple[str, dict[str, Any]]]:
     return series
 
 
-def _of_the_run(run: Run, block: Columns) -> tuple[Columns, int]:
+def _of_the_run(between_s: tuple[float, float], block: Columns) -> tuple[Columns, int]:
     """The records of a block whose own time can be of the run, and how many others there are."""
-    first_s, last_s = own_times_s(run.logs[-1], run.start_ns / 1e9, run.end_ns / 1e9)
+    first_s, last_s = between_s
     own_s = block["publish_time_ns"] / 1e9
     inside = (own_s >= first_s) & (own_s <= last_s)
     left_out = int(np.count_nonzero(~inside))

@@ -163,9 +163,8 @@ def _in_mode(modes: _Modes, topic: str, utc_ns: Any, mode: Mode) -> NDArray[np.b
 
 def _fields(path: Path, topic: str) -> list[str]:
     """The numbers that a topic has."""
-    with contextlib.suppress(
-        ForeignTopicError
-    ):  # one of another program hinders no plot of fitctl's
+    # A topic of another program hinders no plot of fitctl's.
+    with contextlib.suppress(ForeignTopicError):
         for _, columns in column_blocks(path, [topic], 1):
             return [
                 name

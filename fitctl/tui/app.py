@@ -30,7 +30,7 @@ from fitctl.messages.commands import (
     Stop,
     TakeOver,
 )
-from fitctl.messages.modes import Mode
+from fitctl.messages.modes import AT_REST
 from fitctl.messages.telemetry import Telemetry
 from fitctl.tui.alarms import AlarmBook
 from fitctl.tui.commands import BY_NAME, OPERATOR_COMMANDS, SCREENS, keys_of
@@ -59,7 +59,6 @@ from fitctl.tui.wire import UNREADABLE_NOTICE_S, NoLink, Wire
 BEAT_S = 0.1
 """How often something is drawn, if the machine allows; a panel says at which of these beats."""
 _NEVER_S = 1e9  # when Textual would let go of a notice by itself
-_STOPPED = frozenset({Mode.SAFE.name, Mode.OFF.name})
 _UNCONFIRMED_S = 20.0  # a notice of a command that may not have arrived
 KEEP_S = 4.0  # a console that is open keeps the lease of its user; less than the shortest lease
 
@@ -253,7 +252,7 @@ class ConsoleApp(App[None]):
         live, notice = self.playback.live, self._stop_notice
         if notice is None or live.stale or live.newest is None:
             return
-        if all(loop.mode in _STOPPED for loop in live.newest.loops):
+        if {loop.mode for loop in live.newest.loops} <= {mode.name for mode in AT_REST}:
             self._stop_notice = None
             self._notice_s.pop(notice.identity, None)
             self._unnotify(notice)

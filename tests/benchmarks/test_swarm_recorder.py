@@ -36,23 +36,24 @@ def test_a_recorder_that_dies_loses_nothing_that_was_not_confirmed(time, queue):
     assert recorder.unaccounted(queue.offered) == ""
 
 
-def test_what_a_full_disk_keeps_out_is_counted(time, queue):
+def on_a_full_disk(queue, time):
     recorder = SwarmRecorder(time, queue)
     recorder.disk_is_full = True
     for _ in range(10):
         offer(queue, time, 10)
         time.run_until(time.now_s() + 1.0)
+    return recorder
+
+
+def test_what_a_full_disk_keeps_out_is_counted(time, queue):
+    recorder = on_a_full_disk(queue, time)
 
     assert queue.lost > 0
     assert recorder.unaccounted(queue.offered) == ""
 
 
 def test_a_record_that_nobody_counts_is_noticed(time, queue):
-    recorder = SwarmRecorder(time, queue)
-    recorder.disk_is_full = True
-    for _ in range(10):
-        offer(queue, time, 10)
-        time.run_until(time.now_s() + 1.0)
+    recorder = on_a_full_disk(queue, time)
     queue.lost = 0
 
     assert "0 counted" in recorder.unaccounted(queue.offered)

@@ -236,8 +236,7 @@ def _reply(client: Client, command: AnyCommand) -> Reply | ConnectionError:
     try:
         return client.send(command)
     except ConnectionError as error:
-        may_move = client.folder is None or running_rig(client.folder) is not None
-        if isinstance(command, Stop) and may_move:
+        if isinstance(command, Stop) and (client.folder is None or running_rig(client.folder)):
             return ConnectionError(f"{error}; the instrument may still move: cut its power")
         return error
 

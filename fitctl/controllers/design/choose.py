@@ -116,9 +116,8 @@ def solving(
         with np.errstate(all="ignore"), warnings.catch_warnings():
             # What comes of an ill-conditioned problem is judged: by stability and margins.
             warnings.simplefilter("ignore", LinAlgWarning)
-            warnings.simplefilter(
-                "ignore", RuntimeWarning
-            )  # scipy's own, which errstate does not reach
+            # scipy's own, which errstate does not reach:
+            warnings.simplefilter("ignore", RuntimeWarning)
             yield
     except (ValueError, ArithmeticError) as error:
         where = f"camera and loops.{loop_name}.vernier"

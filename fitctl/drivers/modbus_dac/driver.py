@@ -11,6 +11,7 @@ from pymodbus.pdu.register_message import (
 )
 
 from fitctl.config import ModbusDacDevice
+from fitctl.drivers.endpoint import Endpoint
 from fitctl.drivers.interface import (
     DeviceError,
     DeviceIdentity,
@@ -56,7 +57,7 @@ class ModbusDac:
 
     def __init__(self, dac: ModbusDacDevice) -> None:
         self._dac = dac
-        self._endpoint = dac.endpoint
+        self._endpoint = Endpoint(_NAME, dac.endpoint)
         self._link: Link | None = None
         self._written = encode_pdu(
             WriteMultipleRegistersResponse(address=dac.first_register, count=CHANNELS)
@@ -74,9 +75,8 @@ class ModbusDac:
         try:
             self._link = (RtuLink if self._dac.transport == "rtu" else TcpLink)(self._dac)
         except (OSError, ValueError) as error:  # ValueError: a host that is no name at all
-            raise DeviceUnreachable(
-                _NAME,
-                self._endpoint,
+            raise self._endpoint.error(
+                DeviceUnreachable,
                 "a Modbus station",
                 str(error),
                 f"check its power, its cable, and {self._where} in the rig file",
@@ -186,9 +186,7 @@ class ModbusDac:
 
     def _send(self, request: ModbusPDU) -> None:
         if self._link is None:
-            raise DeviceUnreachable(
-                _NAME, self._endpoint, "an open connection", "none", "open it again"
-            )
+            raise self._endpoint.not_open()
         try:
             self._link.send(request)
         except OSError as error:
@@ -201,9 +199,7 @@ class ModbusDac:
         function_code = request.function_code
         expected = f"an answer to function {function_code}"
         if self._link is None:
-            raise DeviceUnreachable(
-                _NAME, self._endpoint, "an open connection", "none", "open it again"
-            )
+            raise self._endpoint.not_open()
         try:
             answer = self._link.receive()
         except NonsenseError as error:
@@ -211,9 +207,8 @@ class ModbusDac:
         except OSError as error:
             raise self._broken(error) from error
         if answer is None:
-            raise DeviceTimeout(
-                _NAME,
-                self._endpoint,
+            raise self._endpoint.error(
+                DeviceTimeout,
                 f"{expected} within {self._dac.response_timeout_s:g} s",
                 "none",
                 f"check dac.device_id, {self._where}, and that no other master keeps it busy",
@@ -224,9 +219,8 @@ class ModbusDac:
         if code is None:
             raise self._nonsense(expected, answer[:32].hex(" "))
         name, hint = EXCEPTIONS.get(code, ("an unknown exception", "see the station's manual"))
-        raise DeviceRefused(
-            _NAME,
-            self._endpoint,
+        raise self._endpoint.error(
+            DeviceRefused,
             f"function {function_code} to be carried out",
             f"exception {code:02X}, {name}",
             hint,
@@ -234,9 +228,8 @@ class ModbusDac:
 
     def _broken(self, error: OSError) -> DeviceUnreachable:
         self.close()
-        return DeviceUnreachable(
-            _NAME,
-            self._endpoint,
+        return self._endpoint.error(
+            DeviceUnreachable,
             "an answer",
             f"a broken connection ({error})",
             "check its power and its cable, then recover",
@@ -246,4 +239,4 @@ class ModbusDac:
         """An answer that cannot be; the connection goes, because the next one would be out of step."""
         self.close()
         hint = f"check that {self._where} lead to the D/A, and that nothing else talks on its line"
-        return DeviceProtocolError(_NAME, self._endpoint, expected, got, hint)
+        return self._endpoint.error(DeviceProtocolError, expected, got, hint)

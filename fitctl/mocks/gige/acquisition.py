@@ -62,7 +62,7 @@ class Acquisition:
     Attributes
     ----------
     late_frames : int
-        Frames, and how many left more than 2 ms after their time.
+        How many frames left more than 2 ms after their time.
     worst_late_s : float
         By how much the latest one was late.
     """

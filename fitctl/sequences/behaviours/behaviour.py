@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from fitctl.config import Rig
 from fitctl.messages.commands import Release
-from fitctl.messages.modes import Mode
+from fitctl.messages.modes import AT_REST, Mode
 from fitctl.model.optics import scales
 from fitctl.sequences.steps import Moving
 from fitctl.sequences.view import Figures, View
@@ -82,7 +82,7 @@ class Behaviour(NamedTuple):
     of_beams: bool = False
 
 
-POWERED = frozenset(set(Mode) - {Mode.OFF, Mode.SAFE})
+POWERED = frozenset(Mode) - AT_REST
 
 
 def frames_due(duration_s: float, rig: Rig) -> int:

@@ -17,7 +17,6 @@ from fitctl.tui.inks import DIM, FAINT, GREEN, PINK, SKY, WHITE, YELLOW
 
 Polyline = NDArray[np.float64]
 
-"""Side of the centroid's window; a tick names its central pixel."""
 OTHER_SPOT = "◦"
 _LIGHT_PX = 4.0  # from a spot's middle to where its light ends
 OVERLAY_INKS = (WHITE, SKY, GREEN, PINK, YELLOW, DIM, FAINT)
