@@ -71,6 +71,7 @@ def test_a_setting_of_the_sky_is_true_of_each_star_and_known_if_it_is_told():
     assert [(rate.az, rate.el) for rate in known[1]] == [(0.2, -0.1)] * 2
 
 
+@pytest.mark.long
 def test_after_each_gust_the_stars_vibrate_as_before_and_all_are_over_when_the_healing_begins():
     rig = "two-stars.toml"
     for seed in range(50):

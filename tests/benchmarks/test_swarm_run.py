@@ -31,6 +31,7 @@ def test_each_rig_holds_its_stars_where_nothing_happens(rig, settings):
     assert result.modes["VERNIER"] >= 1
 
 
+@pytest.mark.long
 def test_a_learnt_design_comes_by_itself_while_the_star_is_held():
     learnt = report(design_json=LEARNT_DESIGNS[0])
     learner = [gives(float(at_s), learnt) for at_s in range(2, 40, 4)]

@@ -170,6 +170,7 @@ def test_ctrl_c_during_the_imports_ends_without_a_traceback(monkeypatch):
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["check", default_rig_path()]])
+@pytest.mark.long
 def test_output_that_a_full_disk_refuses_gets_a_clear_line(arguments):
     with open("/dev/full", "w") as full:
         result = subprocess.run(

@@ -122,6 +122,7 @@ def test_a_correction_that_the_rig_file_contradicts_is_named_and_not_written(cou
     assert load_rig(course.files.rig).loops["right"].siderostat.spur_gear_ratio == 25.0
 
 
+@pytest.mark.long
 def test_a_later_step_works_with_what_earlier_ones_found_and_a_repeat_without_its_own(
     course, table
 ):
@@ -254,6 +255,7 @@ def test_an_interrupted_repeat_leaves_the_commissioned_rig_file_whole(course, ta
     assert load_rig(course.files.rig).loops["right"].siderostat.spur_gear_ratio == 26.0
 
 
+@pytest.mark.long
 def test_a_repeat_that_fails_or_is_skipped_keeps_what_was_found_and_what_depends_on_it(
     course, table
 ):

@@ -150,6 +150,7 @@ def fitted(*settings):
     along=st.floats(2.0, 37.0),
     edge=st.sampled_from(EDGES),
 )
+@pytest.mark.long
 def test_near_an_edge_of_the_frame_the_fit_is_as_good(expose, away, along, edge):
     _, sensor = fitted()
     place = from_edge(edge, away, along)

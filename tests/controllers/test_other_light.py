@@ -89,6 +89,7 @@ def test_a_star_beside_its_own_spot_is_fitted_as_well_where_it_was_not_expected(
 
 
 @given(st.tuples(*[st.floats(-40.0, 40.0)] * 2), st.floats(0.5, 6.0))
+@pytest.mark.long
 def test_light_of_near_spots_is_that_of_any_spot(star_px, diameter_px):
     loop = load_rig(default_rig_path()).loops["right"]
     loop = loop.model_copy(update={"spot_diameter_px": diameter_px})

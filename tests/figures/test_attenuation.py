@@ -77,6 +77,7 @@ def test_the_open_loop_is_rebuilt_to_what_the_star_does_above_stages_at_rest(rig
     assert np.ptp(difference_px, axis=0).max() < BACKLASH_PX + 0.1
 
 
+@pytest.mark.long
 def test_a_running_loop_attenuates_as_its_design_says(rig, held):
     its_basis = basis(rig, "right")
     design = DESIGNS["minimum-variance"](its_basis)

@@ -54,6 +54,7 @@ def test_the_same_data_give_the_same_svg(rig, folder, stack, tmp_path):
     assert one == other
 
 
+@pytest.mark.long
 def test_a_model_read_from_one_ramp_follows_the_stack_within_half_a_percent(stack):
     assert value(stack, "RMS model error") < 0.5
 
@@ -65,6 +66,7 @@ def test_the_step_of_figure_3_stays_within_the_converter():
     assert volts.max() < 10.0
 
 
+@pytest.mark.long
 def test_the_paper_s_own_equations_give_less_than_its_text_says(loops):
     assert value(loops, "crossover (not bandwidth)") == pytest.approx(3.7, abs=0.1)
     assert value(loops, "attenuation at 1 Hz") == pytest.approx(6.5, abs=0.2)

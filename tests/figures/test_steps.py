@@ -19,6 +19,7 @@ def test_the_star_truly_jumps_and_in_one_axis_only(near):
     assert abs(moved_px[AZ]) < 0.2
 
 
+@pytest.mark.long
 def test_the_mirror_answers_first_and_the_siderostat_takes_over(near):
     soon, late = np.searchsorted(near.time_s, [STEP_AT_S + 1.0, STEP_AT_S + 19.0])
 

@@ -129,6 +129,7 @@ def test_the_joint_fit_holds_the_plants_air_path(rig, result):
     assert result.joint.b2_s.covers(truth.b2_s)
 
 
+@pytest.mark.long
 def test_the_noise_floor_of_each_spot_is_that_of_its_light(rig, result):
     for (az, el), spot in zip(result.fits, rig.plant.loops["right"].spots, strict=True):
         expected_px = centroid_noise_px(rig.camera, spot.flux_dn, 7)

@@ -122,6 +122,7 @@ def test_saturated_pixels_do_not_count(rig):
     assert found.diameter_px == pytest.approx(3.0, abs=0.002)
 
 
+@pytest.mark.long
 def test_frames_that_lack_half_of_the_star_s_pixels_do_not_count(rig, tmp_path):
     striped = with_bad_pixels(rig, tmp_path, np.s_[14:27:3, 14:27])
     spot.analyse(striped, "right", frames(rig, 3.0, count=200))

@@ -40,6 +40,7 @@ def advised(paper, fixed, truth, other_hz=OTHER_HZ, **options):
 
 
 @pytest.mark.parametrize("hz", [4.0, 6.0, 14.0])
+@pytest.mark.long
 def test_a_line_that_stays_where_it_was_is_no_alias_and_is_counteracted_in_full(paper, fixed, hz):
     advice = advised(paper, fixed, shaken(paper, hz), classifying_rate([hz], RATE_HZ))
     (line,) = advice.lines
@@ -51,6 +52,7 @@ def test_a_line_that_stays_where_it_was_is_no_alias_and_is_counteracted_in_full(
 
 
 @pytest.mark.parametrize("hz", [44.0, pytest.param(56.0, marks=pytest.mark.long), 94.0])
+@pytest.mark.long
 def test_a_line_that_moves_is_an_alias(paper, fixed, hz):
     advice = advised(paper, fixed, shaken(paper, hz))
     (line,) = advice.lines
@@ -61,6 +63,7 @@ def test_a_line_that_moves_is_an_alias(paper, fixed, hz):
     assert f"an alias, probably of {line.true_hz:.1f} Hz" in "\n".join(advice.lines_of_text())
 
 
+@pytest.mark.long
 def test_a_night_with_a_known_alias_is_estimated_with_the_line_where_it_is(paper, fixed):
     truth = dataclasses.replace(paper, lines=(Line(57.4, 0.005, 0.07),))
     night = advised(paper, fixed, truth).night
@@ -72,6 +75,7 @@ def test_a_night_with_a_known_alias_is_estimated_with_the_line_where_it_is(paper
     assert night.test.fits
 
 
+@pytest.mark.long
 def test_a_design_that_counteracts_an_alias_gives_way_to_one_that_knows_it(paper, fixed):
     """Although it leaves less on the last minute's frames."""
     truth = shaken(paper, 44.0)
@@ -93,6 +97,7 @@ def test_each_of_several_lines_is_told(paper, fixed):
     assert found == {4: 4, 11: 39}
 
 
+@pytest.mark.long
 def test_a_line_is_not_called_slow_where_a_faster_one_would_stay_too(paper, fixed):
     """196 Hz looks like 4 Hz at both rates."""
     advice = advised(paper, fixed, shaken(paper, 4.0), 48.0)
@@ -101,6 +106,7 @@ def test_a_line_is_not_called_slow_where_a_faster_one_would_stay_too(paper, fixe
     assert classifying_rate([4.0], RATE_HZ) != 48.0
 
 
+@pytest.mark.long
 def test_too_few_frames_at_another_rate_tell_nothing(paper, fixed):
     truth = shaken(paper, 6.0)
     _, series = held(truth, fixed, TWO_MINUTES_S, 5)
@@ -117,6 +123,7 @@ def test_too_few_frames_at_another_rate_tell_nothing(paper, fixed):
     ("told", "expected_hz"),
     [(Classified(6.2, 6.2), 6), (Classified(6.2, 43.8), 44), (Classified(5.5, 5.5), None)],
 )
+@pytest.mark.long
 def test_what_was_told_before_counts_for_the_same_line(paper, fixed, told, expected_hz):
     truth = shaken(paper, 6.0)
     _, series = held(truth, fixed, TWO_MINUTES_S, 5)
@@ -184,6 +191,7 @@ def test_a_line_with_an_alias_in_its_place_is_not_called_one(paper, fixed, seed)
     assert classified(paper, fixed, truth, truth, classifying_rate([3.1], RATE_HZ), seed) == []
 
 
+@pytest.mark.long
 def test_a_line_that_explains_part_of_another_is_not_called_an_alias(paper, fixed):
     """What looks like one broad line is two at 47 frames/s, of which the alias is near other aliases."""
     air = paper.air_path.model_copy(update={"gain_px": 0.25, "b1_s2": 0.58})

@@ -236,6 +236,7 @@ def test_the_learnt_design_comes_near_the_bound_of_the_true_night(six_hz, fixed)
     assert advice.worth_it
 
 
+@pytest.mark.long
 def test_an_operator_is_told_what_more_writes_of_the_mirror_would_allow(six_hz):
     truth, advice = six_hz
     several = bound(dataclasses.replace(truth, writes=5)).residual_px

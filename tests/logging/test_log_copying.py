@@ -85,6 +85,7 @@ def test_of_a_log_damaged_anywhere_only_sound_records_are_recovered(whole, data)
         assert all(entry in rest for entry in result[1])  # in their order, none invented
 
 
+@pytest.mark.long
 def test_a_damaged_index_costs_nothing(whole):
     """A topic is described in it, too: what the chunks say of it comes first."""
     path, everything = whole

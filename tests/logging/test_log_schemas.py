@@ -93,6 +93,7 @@ ANY_VALUE = {
 
 
 @given(st.builds(Tick, **{f.name: ANY_VALUE[f.type] for f in msgspec.structs.fields(Tick)}))
+@pytest.mark.long
 def test_a_tick_survives_the_wire_bit_by_bit(tick):
     message = to_message(tick, WALL_NS)
     back = type(message).FromString(message.SerializeToString())

@@ -79,6 +79,7 @@ def test_the_siderostat_moves_as_told_and_returns(held):
     assert after_rad == pytest.approx(before_rad, abs=0.1)
 
 
+@pytest.mark.long
 def test_after_an_experiment_the_star_is_held_again(held):
     simulation, loop, _ = held()
     begin(simulation, SWEEP)

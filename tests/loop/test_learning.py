@@ -84,6 +84,7 @@ def test_advice_tells_the_gain_and_the_command_once(shaken):
     assert night.loop.state(0.0).learning.state == "advice"
 
 
+@pytest.mark.long
 def test_a_night_that_the_design_in_force_suits_gives_no_event():
     night = Night(learn="advise")
     night.report(worth_it=False)
@@ -130,6 +131,7 @@ def test_a_report_without_a_design_says_why_once():
     assert night.loop.state(0.0).learning.state == "failed"
 
 
+@pytest.mark.long
 def test_the_operator_applies_what_was_advised():
     night = Night(*SHAKEN, learn="advise")
     refused = night.simulation.command(SetController(name="learnt"))

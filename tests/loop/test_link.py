@@ -369,6 +369,7 @@ def test_what_was_turned_before_the_links_encoders_lost_their_zero_is_not_undone
     held.until(limit_s=20.0, left=Mode.VERNIER)
 
 
+@pytest.mark.long
 def test_a_place_that_a_command_gives_is_one_with_the_link_as_it_is(held):
     """It is that of the siderostat's own encoders, wherever the link's siderostat has turned."""
     held.drift(0.3)
@@ -404,6 +405,7 @@ class LooseDiode:
 
 
 @pytest.mark.parametrize("travel_rad", [74.0, 1.0], ids=["far from its end", "near its end"])
+@pytest.mark.long
 def test_a_photodiode_that_comes_loose_for_a_second_turns_the_left_siderostat_little_and_costs_no_star(
     held, travel_rad
 ):
@@ -429,6 +431,7 @@ def test_a_photodiode_that_comes_loose_for_a_second_turns_the_left_siderostat_li
     assert (rms_px < held.loop(LEFT).settings.requirement_px).all()
 
 
+@pytest.mark.long
 def test_a_star_that_moves_while_its_link_is_lost_is_held_again_without_a_search():
     moves = "loops.left.star_rate_sky_arcsec_s={az=12.0, el=-9.0}"
     one = Testbed(moves, f"plant.{moves}").held()
@@ -444,6 +447,7 @@ def test_a_star_that_moves_while_its_link_is_lost_is_held_again_without_a_search
 
 
 @pytest.mark.parametrize("amplitude_mm", [0.5, -0.5])
+@pytest.mark.long
 def test_a_link_that_turns_beyond_the_left_siderostats_travel_and_back_leaves_it_where_it_was(
     held, amplitude_mm
 ):
@@ -460,6 +464,7 @@ def test_a_link_that_turns_beyond_the_left_siderostats_travel_and_back_leaves_it
     assert siderostat.setpoint_rad == pytest.approx(before_rad, abs=0.2)
 
 
+@pytest.mark.long
 def test_an_experiment_meanwhile_changes_nothing_of_that(held):
     held.run(2.0)
     siderostat = held.loop(LEFT).siderostat
@@ -474,6 +479,7 @@ def test_an_experiment_meanwhile_changes_nothing_of_that(held):
     assert siderostat.setpoint_rad == pytest.approx(before_rad, abs=0.2)
 
 
+@pytest.mark.long
 def test_a_frozen_loop_that_lost_its_star_finds_it_again():
     one = Testbed('interlocks.flux_low.action="freeze"').held()
     one.run(1.0)

@@ -91,6 +91,7 @@ def test_the_second_integrator_removes_the_standing_error_of_a_drift():
     assert abs(with_it.beam_arcsec()[0]) < 0.1
 
 
+@pytest.mark.long
 def test_a_beam_cut_for_5_s_is_held_again_where_the_collector_has_gone():
     one = bench(collector_m=drift).held().run(10.0)
     one.diodes.light = 0.0

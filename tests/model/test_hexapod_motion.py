@@ -67,6 +67,7 @@ def test_from_rest_the_way_is_straight_and_the_platform_within_its_limits(target
 
 
 @given(moves=courses)
+@pytest.mark.long
 def test_every_plan_ends_at_its_target_at_rest(moves):
     for (_, trajectory), (target, _) in zip(course(moves)[1:], moves, strict=True):
         before_s = math.nextafter(trajectory.ends_s, -math.inf)
@@ -77,6 +78,7 @@ def test_every_plan_ends_at_its_target_at_rest(moves):
 
 
 @given(moves=courses)
+@pytest.mark.long
 def test_pose_and_velocity_are_continuous_where_a_move_is_planned_anew(moves):
     planned = course(moves)
     for (_, before), (began_s, after) in itertools.pairwise(planned):
@@ -121,6 +123,7 @@ def test_a_lower_velocity_limit_is_reached_and_kept(after_s, lower, goal):
 
 
 @given(moves=courses, after_s=st.floats(0.0, 4.0))
+@pytest.mark.long
 def test_a_stop_brakes_all_axes_together_along_their_line(moves, after_s):
     began_s, trajectory = course(moves)[-1]
     at_s = began_s + after_s
@@ -153,6 +156,7 @@ def test_targets_streamed_along_a_sine_are_followed_smoothly(rate_hz):
 
 
 @given(moves=courses)
+@pytest.mark.long
 def test_a_motion_remembers_where_it_was_before_it_was_planned_anew(moves):
     motion, now_s, seen = HexapodMotion(START), 0.0, []
     for target, after_s in moves:

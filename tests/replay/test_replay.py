@@ -12,8 +12,26 @@ from fitctl.logging.records import ControllerChange, ModeChange
 from fitctl.messages.commands import Acquire, Standby, Stop
 from fitctl.replay.devices import LoggedExecutor
 
+QUICK = {
+    "every command",
+    "another star",
+    "a lost star",
+    "nothing opens",
+    "interlocks",
+    "a stall",
+    "a star of a killed supervisor",
+    "the camera fails",
+    "the piezo amplifier is silent",
+}
 
-@pytest.mark.parametrize(("course", "overrides", "happens"), COURSES.values(), ids=COURSES.keys())
+
+@pytest.mark.parametrize(
+    ("course", "overrides", "happens"),
+    [
+        pytest.param(*course, id=name, marks=[] if name in QUICK else pytest.mark.long)
+        for name, course in COURSES.items()
+    ],
+)
 def test_a_run_replayed_is_the_same_to_the_last_bit(logged, course, overrides, happens):
     path, simulation = logged(course, *overrides)
     result = replayed(path)
@@ -25,6 +43,7 @@ def test_a_run_replayed_is_the_same_to_the_last_bit(logged, course, overrides, h
     assert all(found.compared >= 2 * loop.ticks for found in loop.differences.values())
 
 
+@pytest.mark.long
 def test_two_loops_that_do_different_things_are_replayed_together(logged):
     def course(simulation):
         simulation.command(Standby(loop="right"))

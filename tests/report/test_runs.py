@@ -50,6 +50,7 @@ def halves(held, tmp_path):
     return tmp_path
 
 
+@pytest.mark.long
 def test_a_run_of_several_files_is_one_and_what_two_have_counts_once(halves, held, findings):
     found = find(find_run([halves / "b.mcap", halves / "a.mcap"]))
 

@@ -56,6 +56,7 @@ def test_a_direction_is_from_azimuth_towards_elevation():
     assert math.degrees(math.atan2(el_mm, az_mm)) == pytest.approx(30.0)
 
 
+@pytest.mark.long
 def test_a_random_velocity_has_its_rms_and_correlation():
     settings = motion(kind="random", rms_mm_s=0.2, correlation_s=5.0, range_mm=1e6)
     way = ways(course_of(settings, 3), 4000.0, PERIOD_S)[:, 0]

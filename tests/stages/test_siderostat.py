@@ -64,6 +64,7 @@ def test_a_place_beyond_the_travel_that_is_undone_is_wanted_until_the_next(stage
         max_size=8,
     )
 )
+@pytest.mark.long
 def test_whatever_is_asked_for_no_setpoint_is_beyond_the_travel(moves):
     one = SiderostatStage(load_rig(default_rig_path()), "right", Servo())
     for method, rad in moves:

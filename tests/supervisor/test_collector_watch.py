@@ -299,6 +299,7 @@ def unanswered(*_arguments, **_settings):
 
 
 @pytest.mark.parametrize("device", ["siderostat", "piezo amplifier", "camera"])
+@pytest.mark.long
 def test_the_collector_stops_when_a_device_takes_a_loop_to_safe(monkeypatch, device):
     simulation = drifting()
     right = simulation.devices.loops["right"]

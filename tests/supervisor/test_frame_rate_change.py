@@ -219,6 +219,7 @@ def test_a_camera_that_does_not_answer_for_a_moment_is_set_back_then(held):
 # ---------------------------------------------------------------- for the learner
 
 
+@pytest.mark.long
 def test_the_learner_gets_its_rate_once_and_later_again(held):
     wish = report(worth_it=False, classifying_rate_hz=48.0)
     assert held.command(wish).accepted
@@ -264,6 +265,7 @@ def test_a_rate_that_cannot_be_is_no_wish(held, wish_hz):
     assert period_s(held) == pytest.approx(USUAL_S)
 
 
+@pytest.mark.long
 def test_a_wish_of_long_ago_is_forgotten(held):
     held.command(SetTarget(az_px=22.0, el_px=19.5, loop="right"))
     held.command(report(worth_it=False, classifying_rate_hz=48.0))

@@ -90,6 +90,7 @@ def test_the_star_is_searched_for_where_it_was(simulate_with, overrides):
     until(simulation, Mode.VERNIER, limit_s=60.0)
 
 
+@pytest.mark.long
 def test_a_supervisor_that_is_killed_before_it_opens_anything_passes_on_what_it_was_left(
     simulate_with,
 ):
@@ -106,6 +107,7 @@ def test_a_supervisor_that_is_killed_before_it_opens_anything_passes_on_what_it_
     assert search_from_arcsec(simulation, held_arcsec) < 40.0
 
 
+@pytest.mark.long
 def test_without_it_the_search_begins_where_the_siderostat_stands(simulate_with):
     simulation = simulate_with(star_offset_px=(10.0, -6.0))
     held_arcsec = searches_elsewhere(simulation)

@@ -74,6 +74,7 @@ def test_amplifiers_keep_their_power_however_long_the_recovery_from_safe_takes(
     until(vernier, Mode.VERNIER)
 
 
+@pytest.mark.long
 def test_a_siderostat_that_does_not_come_to_where_the_search_begins_is_told(vernier, monkeypatch):
     vernier.command(Release())
     vernier.supervisor.servos["right"].stop()

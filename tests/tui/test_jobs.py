@@ -46,6 +46,7 @@ def test_a_job_is_ended_with_the_console_unless_it_is_to_outlive_it(tmp_path, mo
     assert finished(other) == 2
 
 
+@pytest.mark.long
 def test_a_long_json_document_is_read_whole():
     job = Job(["check", "no-such-rig.toml"])
     finished(job)

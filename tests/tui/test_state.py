@@ -24,6 +24,7 @@ def fed(supervisor, count):
     return state
 
 
+@pytest.mark.long
 def test_ticks_are_kept_for_the_longest_window_and_no_longer():
     state = fed(FakeSupervisor(), 1600)
     times_s = state.loop.errors(1000.0)[:, 0]

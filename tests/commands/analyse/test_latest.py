@@ -193,6 +193,7 @@ def test_python_finds_the_newest_run_of_a_rig_by_its_records_not_by_the_names_of
     assert newest_run(logs, "none") == []
 
 
+@pytest.mark.long
 def test_a_report_says_how_many_records_it_leaves_out(fitctl, logs):
     forged(logs / "a.mcap", logs / "c.mcap", lambda record: {2: 2**62}.get(record.sequence))
 
@@ -238,6 +239,7 @@ def test_a_newer_log_that_cannot_be_read_is_not_passed_over_for_an_older_night(
     assert "It was written after logs/z.mcap, so the newest run may be in it; name a LOG" in problem
 
 
+@pytest.mark.long
 def test_reports_and_designs_of_a_folder_name_what_cannot_be_read_in_it(fitctl, logs):
     (logs / "torn.mcap").write_bytes(b"nothing of MCAP")
 

@@ -51,6 +51,7 @@ def test_a_design_that_is_there_is_overwritten_only_if_asked_to(design, tmp_path
     assert json.loads(path.read_text())["name"] == "eq20"
 
 
+@pytest.mark.long
 def test_the_vernier_in_json_has_what_the_paper_prints(design):
     status, out, _ = design("vernier", "--json")
     found = json.loads(out)
@@ -131,6 +132,7 @@ def test_all_designs_beside_the_bound(design):
     assert ratios["minimum-variance"] < 1.03 < ratios["eq20"]
 
 
+@pytest.mark.long
 def test_a_design_is_saved_and_can_be_chosen_by_its_file(design, tmp_path, capsys):
     path = tmp_path / "mine.json"
     status, out, _ = design("minimum-variance", "--out", path)

@@ -160,6 +160,7 @@ def test_a_key_that_is_no_ascii_is_refused_and_is_no_error_of_the_server(page, k
     assert status in {400, 403}
 
 
+@pytest.mark.long
 def test_a_browser_is_given_nothing_that_it_would_show_another_port(page):
     """A cookie of 127.0.0.1 goes to every port there, so also to another user's server."""
     _, headers = ask(page)

@@ -127,8 +127,15 @@ def identified(value):
     return "+".join(choice.kind for choice in value.values()) if isinstance(value, dict) else value
 
 
+def quick_if_most_are_mocks(begun_with, devices):
+    hardware = sum(kind != MOCK for kind, _ in devices.values())
+    return pytest.param(begun_with, devices, marks=[] if hardware < 2 else pytest.mark.long)
+
+
 @pytest.mark.parametrize(
-    ("begun_with", "devices"), ONE_STAR_DEVICES + TESTBED_DEVICES, ids=identified
+    ("begun_with", "devices"),
+    [quick_if_most_are_mocks(*each) for each in ONE_STAR_DEVICES + TESTBED_DEVICES],
+    ids=identified,
 )
 def test_every_combination_of_hardware_is_a_rig_with_just_that(begun_with, devices, tmp_path):
     path = tmp_path / "new.toml"

@@ -121,6 +121,7 @@ def assert_corrected(off, said, *, scale_apart):
 
 @settings(deadline=None)
 @given(st.none() | gains(0.75, 1.35, 0.1), degrees, gains(0.75, 1.35, 0.1), degrees)
+@pytest.mark.long
 def test_with_what_is_found_the_siderostat_of_any_rig_file_has_the_measured_response(
     rig_gains, rig_deg, true_gains, true_deg
 ):
@@ -160,6 +161,7 @@ def test_stacks_that_may_be_exchanged_are_left_as_the_rig_file_has_them_with_a_r
     st.none() | gains(0.85, 1.2, 0.08), degrees, gains(0.85, 1.2, 0.08), st.floats(-30.0, 30.0),
     st.floats(0.6, 1.5),
 )  # fmt: skip
+@pytest.mark.long
 def test_with_what_is_found_the_mirror_of_any_rig_file_has_the_measured_response(
     rig_gains, rig_deg, true_gains, by_deg, size
 ):

@@ -251,6 +251,7 @@ def raised(error):
     return 7e9
 
 
+@pytest.mark.long
 def test_measuring_and_judging_costs_a_small_part_of_a_tick():
     bench = Bench()
     loop, frame = bench.loop, bench.camera.next_frame(0.04)

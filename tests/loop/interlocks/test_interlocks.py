@@ -244,6 +244,7 @@ rows = st.builds(
 
 
 @given(st.dictionaries(st.sampled_from("abcd"), rows, min_size=1), steps)
+@pytest.mark.long
 def test_nothing_acts_untripped_and_nothing_that_needs_a_hand_goes_without(made, course):
     interlocks, readings, now_s = Interlocks(made, {}), {}, 0.0
     tripped: set[str] = set()

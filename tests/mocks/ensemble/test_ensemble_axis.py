@@ -42,6 +42,7 @@ def test_a_free_run_ramps_up_and_stays():
 
 @hypothesis.settings(max_examples=20)
 @given(st.floats(-4.9, 4.9), st.floats(0.5, 20.0))
+@pytest.mark.long
 def test_a_move_ends_where_it_should_and_rests(position, speed):
     axis = enabled_axis()
     axis.move_to(position, speed)

@@ -115,6 +115,7 @@ def test_a_step_begins_once_the_operator_has_said_yes_to_what_it_moves(key, answ
     on_console(scenario)
 
 
+@pytest.mark.long
 def test_each_question_is_asked_once_and_the_next_one_too():
     async def scenario(app, pilot):
         await pressed(app, pilot, "g")
@@ -176,6 +177,7 @@ def test_stop_ends_the_step_also_over_its_question_and_on_another_screen(key):
     assert sent(app) == ([] if key == "z" else [Stop()])
 
 
+@pytest.mark.long
 def test_a_stop_without_reply_is_an_error_unless_nothing_runs():
     async def scenario(app, pilot):
         app._handle_reply(Stop(), None, "no reply")

@@ -33,6 +33,7 @@ def test_a_device_and_a_reading_are_told_in_full():
     run(scenario)
 
 
+@pytest.mark.long
 def test_an_interlock_is_reset_from_its_row():
     async def scenario(app, pilot):
         await pressed(app, pilot, "2", "n")  # no reading is chosen yet
@@ -57,6 +58,7 @@ def test_keys_typed_faster_than_drawn_go_to_the_list_that_tab_chose():
     assert sent(run(scenario)) == [Reset(loop="right", name="dac_slow")]
 
 
+@pytest.mark.long
 def test_a_click_chooses_a_row_and_its_list():
     async def scenario(app, pilot):
         await pressed(app, pilot, "2")
@@ -218,6 +220,7 @@ def test_a_file_that_cannot_be_read_does_not_take_the_place_of_what_moves_the_st
     assert unreadable.ended
 
 
+@pytest.mark.long
 def test_a_list_of_sequences_that_is_not_whole_is_told_and_ends_nothing(monkeypatch):
     async def scenario(app, pilot):
         await pressed(app, pilot, "4")

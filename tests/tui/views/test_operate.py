@@ -35,6 +35,7 @@ def test_a_click_puts_the_cursor_and_moves_nothing_by_itself():
     assert sent(run(scenario)) == []
 
 
+@pytest.mark.long
 def test_the_window_is_put_on_another_star_with_the_same_cursor():
     async def scenario(app, pilot):
         await pressed(app, pilot, "i", "left", "left", "down")
@@ -132,6 +133,7 @@ def test_nothing_is_jogged_by_old_data():
     assert sent(run(scenario, "STANDBY")) == []
 
 
+@pytest.mark.long
 def test_picture_and_window_are_chosen_by_key():
     async def scenario(app, pilot):
         plane = app.view.query_one(FocalPlane)

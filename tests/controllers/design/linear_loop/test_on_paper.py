@@ -77,6 +77,7 @@ def left_px(design, night, disturbance_px):
 
 
 @pytest.mark.parametrize(("alias_hz", "seen_hz"), [(44.0, 6.0), (48.9, 1.1), (94.0, 6.0)])
+@pytest.mark.long
 def test_of_a_known_alias_counts_what_is_left_between_frames(paper, alias_hz, seen_hz):
     """On frames, the design for a slow line leaves much less than in truth."""
     quiet = dataclasses.replace(paper, noise_px=0.003)
