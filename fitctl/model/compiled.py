@@ -11,9 +11,10 @@ import fcntl
 import functools
 import hashlib
 import re
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import IO, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 _PACKAGES = Path(__file__).parents[2]
 _IMPORT = re.compile(rb"^(?:from|import) (fitctl[\w.]*)(?: import (\([^)]*\)|.*))?", re.M)
 _options: dict[Callable[..., Any], dict[str, Any]] = {}  # of all marked functions
+_COMPILES_S = 300.0  # the longest takes a slow computer half of that
 _registered: set[Callable[..., Any]] = set()  # with numba
 
 
@@ -70,6 +72,8 @@ def compiled(function: _Function) -> _Function:
     config: Any = module  # its options are made when it is imported
     kinds: Any = types
     kinds.Record.mangling_args = property(_of_its_layout)
+    # Numba writes out all arguments at each of its passes; their names are at hand.
+    kinds.Record.__repr__ = kinds.NestedArray.__repr__ = kinds.Type.__str__
     for marked in _options.keys() - _registered:
         register_jitable(**_options[marked])(marked)
     _registered.update(_options)
@@ -79,7 +83,7 @@ def compiled(function: _Function) -> _Function:
     folder = cache_folder(function.__module__)
     given, config.CACHE_DIR = config.CACHE_DIR, str(folder)
     try:
-        return _saved_by_one_at_a_time(njit(cache=True, **options)(function), folder / "lock")
+        return _compiled_by_one_at_a_time(njit(cache=True, **options)(function), folder / "lock")
     except RuntimeError:  # the folder cannot be written: each process compiles anew
         return njit(**options)(function)
     finally:
@@ -95,22 +99,37 @@ def _of_its_layout(kind: Any) -> tuple[str, tuple[int]]:
     return "Record", (int.from_bytes(hashlib.sha256(kind.name.encode()).digest()[:7]),)
 
 
-def _saved_by_one_at_a_time(made: Any, lock: Path) -> Any:
-    """Lock the folder of machine code while a process saves some.
+def _compiled_by_one_at_a_time(made: Any, lock: Path) -> Any:
+    """Lock the folder of machine code while a process compiles and saves; those that wait load what it saved.
 
     Numba names files by number: the first that its index lacks. Two processes that save code for different
     arguments at once would give both one name, and then run each other's code.
     """
-    cache = made._cache
-    save = cache.save_overload
+    from numba.core.caching import NullCache
 
-    def save_alone(signature: Any, data: Any) -> None:
-        with lock.open("a") as held:
-            fcntl.flock(held, fcntl.LOCK_EX)  # until the file is closed
-            save(signature, data)
+    compile_overload = made.compile
 
-    cache.save_overload = save_alone
+    def compile_alone(signature: Any) -> Any:
+        with lock.open("a") as held:  # until the file is closed
+            if not _locked(held):
+                made._cache = NullCache()  # the other does not go on, and may save when it does
+            return compile_overload(signature)
+
+    made.compile = compile_alone
     return made
+
+
+def _locked(file: IO[str]) -> bool:
+    """Whether a lock could be had within `_COMPILES_S`."""
+    until_s = time.monotonic() + _COMPILES_S
+    while time.monotonic() < until_s:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            time.sleep(0.05)
+        else:
+            return True
+    return False
 
 
 def record(values: Mapping[str, Any]) -> NDArray[np.void]:

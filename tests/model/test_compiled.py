@@ -1,5 +1,6 @@
 """Machine code is kept for other processes, and made anew when any source of it changes."""
 
+import fcntl
 import subprocess
 import sys
 from pathlib import Path
@@ -106,6 +107,40 @@ def test_processes_that_save_code_for_different_arguments_at_once_keep_their_own
     third = started("[1.0, 1, np.float32(1.0)]").communicate(timeout=60)[0]
 
     assert third.splitlines()[-1] == "[6.0, 6.0, 6.0] 3"
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not numba_installed(), reason="numba is not installed (extra `fast`)")
+def test_of_processes_that_need_the_same_code_one_compiles_and_the_other_loads_it(package):
+    program = "from fitctl.simulation.trial_kernel import kernel"
+    both = [
+        subprocess.Popen(
+            [sys.executable, "-c", program], cwd=package.parent, stdout=subprocess.PIPE, text=True
+        )
+        for _ in range(2)
+    ]
+
+    assert sorted(one.communicate(timeout=60)[0] for one in both) == ["6.0 0\n", "6.0 1\n"]
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not numba_installed(), reason="numba is not installed (extra `fast`)")
+def test_who_waits_in_vain_for_another_process_compiles_without_saving(package):
+    source = package / "model" / "compiled.py"
+    assert "_COMPILES_S = 300.0" in source.read_text()
+    source.write_text(source.read_text().replace("_COMPILES_S = 300.0", "_COMPILES_S = 0.5"))
+    assert run_kernel(package) == (6.0, 0)
+    (folder,) = (package / "__pycache__").glob("compiled-*")
+    for code in folder.rglob("*.nb?"):
+        code.unlink()
+
+    with (folder / "lock").open("a") as held:
+        fcntl.flock(held, fcntl.LOCK_EX)
+        assert run_kernel(package) == (6.0, 0)
+        assert run_kernel(package) == (6.0, 0)
+
+    assert run_kernel(package) == (6.0, 0)
+    assert run_kernel(package) == (6.0, 1)
 
 
 NAMED = """
