@@ -97,7 +97,7 @@ test-slow: $(READY)  ## Run the acceptance tests: ten demos of a minute each, te
 
 test-console: $(READY)  ## Test the tutorial as typed, and the console by keys (tmux) and in a browser (Chromium)
 	-@tests/install-packages tmux chromium
-	$(BIN)/pytest -m terminal tests/system --numprocesses 2 $(ARGS)
+	$(BIN)/pytest -m terminal tests/system --numprocesses 2 --dist worksteal $(ARGS)
 
 test-faults: $(READY)  ## Run the fault catalogue on the instrument, in real time
 	$(BIN)/pytest -m "fault and not testbed" $(FAULTS) $(ARGS)
@@ -107,11 +107,11 @@ test-faults-all: $(READY)
 
 # As much as fits into continuous integration; with the PART_SEED that it prints, a run is repeated.
 PART_SEED := $(or $(PART_SEED),$(shell od -An -N2 -tu2 /dev/urandom | tr -d ' '))
-test-long-part: export FITCTL_TESTS_PART = 100
+test-long-part: export FITCTL_TESTS_PART = 70
 test-instrument-part: export FITCTL_TESTS_PART = 16
 test-faults-part: export FITCTL_TESTS_PART = 25
 %-part: export FITCTL_TESTS_SEED = $(PART_SEED)
-test-long-part: test-long  ## Run 100 of the tests of test-long, drawn at random
+test-long-part: test-long  ## Run 70 of the tests of test-long, drawn at random
 test-instrument-part: test-instrument  ## Run 16 tests of test-instrument, drawn at random, and those that must run alone
 test-faults-part: test-faults-all  ## Run 25 entries of the whole fault catalogue, drawn at random
 

@@ -73,6 +73,7 @@ def test_a_corrected_step_keeps_what_it_measured_before(course, table):
     }
 
 
+@pytest.mark.long
 def test_an_estimate_is_taken_without_a_second_measurement(course, table):
     done = []
     table(
@@ -84,6 +85,7 @@ def test_an_estimate_is_taken_without_a_second_measurement(course, table):
     assert do(course, task(course, "later")).figures == {"gear": 26.0}
 
 
+@pytest.mark.long
 def test_what_was_found_counts_above_what_set_says_also_for_processes_of_a_step(course, table):
     spots = [{"name": "fringe", "offset_px": {"az": 9.0, "el": -1.5}, "flux_dn": 400.0}]
     found = {"loops": {"right": GEAR["loops"]["right"] | {"other_spots": spots}}}
@@ -241,6 +243,7 @@ def test_the_shipped_table_needs_only_steps_that_come_before(rig):
         before.add(one.name)
 
 
+@pytest.mark.long
 def test_an_interrupted_repeat_leaves_the_commissioned_rig_file_whole(course, table):
     table(gear=step(corrects_the_gear))
     do(course, task(course, "gear"))

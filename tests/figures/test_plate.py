@@ -2,6 +2,8 @@
 
 import re
 
+import pytest
+
 from fitctl.figures.plate import save
 from fitctl.identify.drawing import BLUE, ON_DARK, for_dark_pages, new_figure
 
@@ -33,6 +35,7 @@ def test_lettering_and_paper_change_places(tmp_path):
     assert f'[style*="fill: #ffffff"] {{ fill: {ON_DARK["#ffffff"]} !important }}' in style
 
 
+@pytest.mark.long
 def test_the_same_data_give_the_same_file_and_a_second_time_changes_nothing(tmp_path):
     first = drawn(tmp_path)
 

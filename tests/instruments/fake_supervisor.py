@@ -7,6 +7,8 @@ the first message, wall time is a winter night.
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 
 from fitctl.logging.records import (
@@ -110,13 +112,15 @@ USABLE = {
     "LOCKED": ["Release"],
 }
 
+_EL_PX, _AZ_PX = np.mgrid[0:SIZE_PX, 0:SIZE_PX]
+_made: dict[tuple[int, bytes], tuple[list[Telemetry], bytes]] = {}
+
 
 def spot_image(rng: np.random.Generator, spots: list[tuple[float, float, float]]) -> np.ndarray:
     """A frame with Gaussian spots, each az px, el px, whole flux in DN; shape (40, 40)."""
-    el, az = np.mgrid[0:SIZE_PX, 0:SIZE_PX]
     image = BIAS_DN + NOISE_DN * rng.standard_normal((SIZE_PX, SIZE_PX))
     for spot_az, spot_el, flux in spots:
-        distance2 = (az - spot_az) ** 2 + (el - spot_el) ** 2
+        distance2 = (_AZ_PX - spot_az) ** 2 + (_EL_PX - spot_el) ** 2
         peak = flux / (2 * np.pi * SPOT_SIGMA_PX**2)
         image += peak * np.exp(-distance2 / (2 * SPOT_SIGMA_PX**2))
     return np.clip(image, 0, 65535).astype("<u2")
@@ -189,7 +193,16 @@ class FakeSupervisor:
         return [loop for loop in self.loops if loop != "metrology"]
 
     def messages(self, count: int) -> list[Telemetry]:
-        return [self.message() for _ in range(count)]
+        """Made once for supervisors in the same state: most tests of the console begin with the same."""
+        key = count, pickle.dumps(vars(self))
+        if key not in _made:
+            messages = [self.message() for _ in range(count)]
+            while len(_made) >= 20:
+                del _made[next(iter(_made))]
+            _made[key] = messages, pickle.dumps(vars(self))
+        messages, left = _made[key]
+        vars(self).update(pickle.loads(left))
+        return list(messages)
 
     def message(self) -> Telemetry:
         """The next message: all ticks of `MESSAGE_S`, events and changes in the very first one."""

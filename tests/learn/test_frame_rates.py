@@ -148,6 +148,7 @@ def classified(paper, fixed, truth, other, other_hz, seed=5):
     return estimated([series], paper, (), [AtOtherRate(1 / other_hz, [shown])])[2]
 
 
+@pytest.mark.long
 def test_a_line_that_moves_is_an_alias_even_if_two_look_the_same(paper, fixed):
     """At 47 frames/s, 26.4 Hz is seen at 20.6 Hz, and 73.6 Hz at 20.4 Hz."""
     truth = dataclasses.replace(paper, lines=(Line(26.4, 0.005, 0.02),))
@@ -157,6 +158,7 @@ def test_a_line_that_moves_is_an_alias_even_if_two_look_the_same(paper, fixed):
     assert line.is_alias
 
 
+@pytest.mark.long
 def test_a_line_at_half_the_rate_is_no_alias_of_itself(paper, fixed):
     """24.96 and 25.04 Hz look the same at every rate, and are the same to the mirror."""
     truth = dataclasses.replace(paper, lines=(Line(24.96, 0.005, 0.05),))
@@ -174,6 +176,7 @@ def test_a_line_that_is_not_there_at_the_other_rate_is_not_classified(paper, fix
 
 
 @pytest.mark.parametrize("seed", [0, 2, pytest.param(4, marks=pytest.mark.long)])
+@pytest.mark.long
 def test_a_weak_alias_makes_no_alias_of_a_strong_slow_line(paper, fixed, seed):
     """At the other rate the slow line is hidden by the air."""
     lines = (Line(1.0, 0.005, 0.045), Line(RATE_HZ + 1.05, 0.001, 0.009))
@@ -184,6 +187,7 @@ def test_a_weak_alias_makes_no_alias_of_a_strong_slow_line(paper, fixed, seed):
 
 
 @pytest.mark.parametrize("seed", [2, pytest.param(4, marks=pytest.mark.long)])
+@pytest.mark.long
 def test_a_line_with_an_alias_in_its_place_is_not_called_one(paper, fixed, seed):
     lines = (Line(3.1, 0.02, 0.025), Line(RATE_HZ + 3.1, 0.002, 0.03))
     truth = dataclasses.replace(paper, lines=lines)
@@ -204,6 +208,7 @@ def test_a_line_that_explains_part_of_another_is_not_called_an_alias(paper, fixe
 
 
 @pytest.mark.parametrize("seed", [0, pytest.param(2, marks=pytest.mark.long)])
+@pytest.mark.long
 def test_what_would_be_seen_near_zero_is_not_classified(paper, fixed, seed):
     """There air looks like a line; at 48.5 frames/s this alias is at 0.3 Hz, on a night of little air."""
     air = paper.air_path.model_copy(update={"gain_px": 0.05})
@@ -215,6 +220,7 @@ def test_what_would_be_seen_near_zero_is_not_classified(paper, fixed, seed):
 # ---------------------------------------------------------------- asking
 
 
+@pytest.mark.long
 def test_a_line_that_is_counteracted_in_part_is_worth_another_rate(paper, fixed):
     truth = shaken(paper, 14.0)
     _, series = held(truth, fixed, TWO_MINUTES_S, 5)
@@ -226,6 +232,7 @@ def test_a_line_that_is_counteracted_in_part_is_worth_another_rate(paper, fixed)
     assert f"fitctl send frame-rate {advice.classifying_rate_hz:g}" in text
 
 
+@pytest.mark.long
 def test_a_line_that_is_hardly_worth_another_rate_does_not_ask_for_one(paper, fixed):
     """A design that knew whether it is an alias would leave 7 % less; another rate itself costs about 1 %."""
     truth = dataclasses.replace(paper, lines=(Line(14.0, 0.005, 0.009),))

@@ -72,6 +72,7 @@ def test_a_first_report_is_due_after_a_minute_of_frames(rig, vernier):
     ],
     ids=lambda change: next(iter(change)),
 )
+@pytest.mark.long
 def test_frames_of_a_disturbed_loop_are_left_out(rig, vernier, disturbed):
     learner = fed(rig, [msgspec.structs.replace(tick, **disturbed) for tick in vernier])
 

@@ -99,6 +99,7 @@ def limits(retain_bytes, retain_days):
     retain_days=st.integers(1, 20),
 )
 @settings(max_examples=80, deadline=None)
+@pytest.mark.long
 def test_the_oldest_go_until_the_rest_fits_but_never_one_in_use_or_kept(
     tmp_path_factory, logs, retain_bytes, retain_days
 ):

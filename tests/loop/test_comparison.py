@@ -120,6 +120,7 @@ def test_a_design_that_is_unstable_on_the_learnt_ones_mirror_is_not_compared(rig
 
 
 @pytest.mark.parametrize("seed", range(3))
+@pytest.mark.long
 def test_with_a_known_alias_designs_are_compared_by_what_they_leave_in_truth(rig, noisy, seed):
     """48.9 Hz looks like 1.1 Hz on frames, where only the design that knows it leaves it alone."""
     quiet = dataclasses.replace(noisy, noise_px=0.003)

@@ -126,6 +126,7 @@ def held():
     return Testbed().held()
 
 
+@pytest.mark.long
 def test_one_command_brings_all_up_in_the_order_in_which_they_depend_on_each_other():
     testbed = Testbed(star_offset_px=None).held()
     locked_s = testbed.first_change(METROLOGY, target="LOCKED").time_s

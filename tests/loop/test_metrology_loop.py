@@ -102,6 +102,7 @@ def test_a_beam_cut_for_5_s_is_held_again_where_the_collector_has_gone():
     assert one.run(10.0).rms_arcsec(5.0) < 0.2
 
 
+@pytest.mark.long
 def test_a_beam_lost_for_a_moment_is_bridged_at_the_learnt_rate():
     one = bench(collector_m=drift).held().run(20.0)
     one.diodes.light = 0.0

@@ -153,6 +153,7 @@ def test_a_rate_that_the_siderostat_cannot_follow_is_refused(held, rate, why_not
     assert why_not in reply.text
 
 
+@pytest.mark.long
 def test_a_star_that_is_dark_for_a_while_is_found_where_it_has_gone(held):
     light = held.camera._scene._flux_dn
     darken(held)

@@ -160,6 +160,7 @@ def motion_px(rig):
     return (spots - [target.az, target.el]).reshape(times_s.size, -1)
 
 
+@pytest.mark.long
 def test_the_plant_moves_by_the_variance_of_eq_9(air, motion_px):
     # A variance over T of a Gaussian signal with autocorrelation r scatters by sqrt(2 int r^2 / T).
     lags_s = np.linspace(-20, 20, 4001)

@@ -228,6 +228,7 @@ def test_stacks_at_the_inverse_voltage_are_where_they_shall_be(history, wanted_m
 
 
 @given(st.lists(wanted, max_size=10))
+@pytest.mark.long
 def test_the_inverse_is_a_model_of_plays_with_a_memory_of_its_own(wishes):
     half_width_m, gains_v_per_m = inverse_model(HALF_WIDTH_V, STACKS_GAINS)
     stacks = own = np.zeros((3, HALF_WIDTH_V.size))

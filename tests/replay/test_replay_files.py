@@ -49,6 +49,7 @@ def test_a_log_that_was_torn_is_replayed_up_to_there(held_log):
     assert 10 < result.loops["right"].ticks < whole
 
 
+@pytest.mark.long
 def test_the_midst_of_a_run_is_refused_whether_cut_soon_or_late(logged, tmp_path):
     def course(simulation):
         hold_a_star(simulation)

@@ -302,6 +302,7 @@ def test_motions_that_a_lost_star_ends_are_not_taken_for_whole_but_made_again(tr
     assert run.figures(2)["seen_fraction"] > 0.99
 
 
+@pytest.mark.long
 def test_motions_that_the_operator_stops_end_at_once(tried):
     run = tried()
     run.link.meddling = [(15.0, SequenceControl(action="end"))]
@@ -325,6 +326,7 @@ def test_attempts_of_a_run_are_recorded_once_each(rig):
     assert recorded == attempts
 
 
+@pytest.mark.long
 def test_a_step_that_acquires_ends_the_search_for_a_lost_star_and_begins_its_own(tried):
     def goes_away(link):
         link._simulation.plants["right"].constants.spot_origin_px[:] += 5000.0

@@ -85,6 +85,7 @@ def test_without_a_star_the_search_ends_in_standby_and_says_so(simulate_with):
     assert any("no star within" in event.message for event in events_of(simulation))
 
 
+@pytest.mark.long
 def test_the_next_search_is_about_the_same_place_as_the_one_that_found_nothing(simulate_with):
     simulation = simulate_with()
     darken(simulation)

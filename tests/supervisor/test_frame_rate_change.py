@@ -74,6 +74,7 @@ def why_not(simulation, **values):
 # ---------------------------------------------------------------- by command
 
 
+@pytest.mark.long
 def test_the_camera_runs_at_another_rate_for_a_while_and_the_star_is_held(held):
     assert why_not(held, rate_hz=48.0, duration_s=10.0) == ""
     held.run(9.0)

@@ -132,6 +132,7 @@ def test_what_is_skipped_is_not_done_even_by_its_name(commission, two_steps):
     assert (status, two_steps) == (0, [])
 
 
+@pytest.mark.long
 def test_two_commissionings_are_compared(commission, two_steps, tmp_path):
     commission("--yes", "--until", "one")
     earlier = tmp_path / "earlier.json"

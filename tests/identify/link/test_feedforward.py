@@ -140,6 +140,7 @@ def test_readings_with_wrong_times_are_left_out_and_told():
     )
 
 
+@pytest.mark.long
 def test_what_the_mirror_makes_up_for_is_less_certain_and_worth_another_scan():
     far, near = (
         feedforward.analyse(RIG, "left", scan(1)),
@@ -159,6 +160,7 @@ def test_the_fragment_has_the_matrix_and_the_whole_gain():
     assert "rig file's gain times matrix" in found.lines()[2]
 
 
+@pytest.mark.long
 def test_an_axis_that_takes_up_its_play_while_it_rests_does_not_count_as_swinging():
     quiet = feedforward.analyse(KNOWN, "left", scan(1, swing_arcsec=8.0, rig=KNOWN))
     taken_up = scan(1, swing_arcsec=8.0, rig=KNOWN, jumps_arcsec=1.0)

@@ -271,6 +271,7 @@ def test_nothing_acts_untripped_and_nothing_that_needs_a_hand_goes_without(made,
 
 
 @given(st.dictionaries(st.sampled_from("abcd"), rows, min_size=1), steps)
+@pytest.mark.long
 def test_values_in_range_and_fresh_trip_nothing(made, course):
     interlocks, now_s = Interlocks(made, {}), 0.0
     for _, _, mode in course:

@@ -86,6 +86,7 @@ def test_a_star_that_is_passed_on_the_way_is_another_one():
     assert not any(tick.star_visible for tick in simulation.ticks if tick.mode == "ACQUISITION")
 
 
+@pytest.mark.long
 def test_a_flux_that_is_asked_for_holds_until_the_next_search_by_command():
     simulation = star_at(0.0, 0.0)
     loop = simulation.supervisor.loops["right"]

@@ -303,6 +303,7 @@ siderostats = stages(ball_screw_m_per_rad=st.floats(1e-4, 1.3e-4))
 
 
 @given(mirrors, siderostats, mirrors, siderostats, st.booleans())
+@pytest.mark.long
 def test_with_its_fragment_any_rig_file_has_the_measured_response(
     fsm, siderostat, true_fsm, true_siderostat, hysteresis
 ):

@@ -197,6 +197,7 @@ def test_nothing_is_hidden_by_a_picture(pictured, cover):
     run_app(app, scenario)
 
 
+@pytest.mark.long
 def test_old_data_are_no_picture_for_they_must_look_old(pictured):
     app, sent = pictured(Graphics.SIXEL)
 

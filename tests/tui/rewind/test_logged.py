@@ -133,6 +133,7 @@ def test_a_log_without_snapshots_shows_what_its_records_have(tmp_path):
     assert state.loop.errors(5.0) == pytest.approx(known.loop.errors(5.0), abs=1e-6)
 
 
+@pytest.mark.long
 def test_where_the_supervisor_was_silent_the_past_is_silent(tmp_path):
     messages = FakeSupervisor().messages(400)
     path = write_log(tmp_path / "log.mcap", [*messages[:100], *messages[300:]])
@@ -284,6 +285,7 @@ def test_a_hostile_log_stays_harmless(tmp_path, seed):
     asyncio.run(main())
 
 
+@pytest.mark.long
 def test_nothing_is_sent_from_a_log(tmp_path):
     messages = FakeSupervisor().messages(100)
     run = LoggedRun(write_log(tmp_path / "log.mcap", messages), loops_at_start)

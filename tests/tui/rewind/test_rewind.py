@@ -177,6 +177,7 @@ def test_commands_wait_until_the_console_is_live_again(command):
     run(scenario)
 
 
+@pytest.mark.long
 def test_keys_that_would_be_refused_are_not_in_the_last_line():
     async def scenario(app, pilot):
         def keys():
@@ -305,6 +306,7 @@ def test_a_rehearsal_is_a_process_of_its_own_and_ends_with_its_dialog():
     run(scenario)
 
 
+@pytest.mark.long
 def test_nothing_is_rehearsed_from_the_past():
     async def scenario(app, pilot):
         await pressed(app, pilot, "comma", "d")

@@ -60,6 +60,7 @@ def test_it_opens_on_the_steps_and_the_next_one_is_chosen():
     on_console(scenario)
 
 
+@pytest.mark.long
 def test_a_record_that_is_not_whole_is_told_and_ends_nothing(monkeypatch):
     async def scenario(app, pilot):
         assert app.view.query_one(StepList).step is None
@@ -69,6 +70,7 @@ def test_a_record_that_is_not_whole_is_told_and_ends_nothing(monkeypatch):
     assert on_console(scenario).jobs[0].ended
 
 
+@pytest.mark.long
 def test_what_a_step_found_and_what_it_needs_is_beside_the_list():
     async def scenario(app, pilot):
         await pressed(app, pilot, "up")
@@ -140,6 +142,7 @@ def test_each_question_is_asked_once_and_the_next_one_too():
     on_console(scenario)
 
 
+@pytest.mark.long
 def test_the_chosen_step_is_repeated():
     async def scenario(app, pilot):
         await pressed(app, pilot, "up", "d")

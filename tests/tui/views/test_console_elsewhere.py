@@ -45,6 +45,7 @@ def commands(app):
 # ---------------------------------------------------------------- without the rig file
 
 
+@pytest.mark.long
 def test_without_the_rig_file_no_margins_are_shown_and_it_is_said_why():
     async def scenario(app, pilot):
         await pressed(app, pilot, "3")

@@ -74,6 +74,7 @@ def test_a_click_chooses_a_row_and_its_list():
 # ---------------------------------------------------------------- sequences
 
 
+@pytest.mark.long
 def test_a_sequence_is_rehearsed():
     async def scenario(app, pilot):
         await pressed(app, pilot, "4", "down", "d")
@@ -294,6 +295,7 @@ def test_a_log_is_looked_into_by_the_command_for_it(tmp_path, key, command):
     run(scenario, log_folder=tmp_path)
 
 
+@pytest.mark.long
 def test_a_log_is_kept_and_no_longer(tmp_path):
     make_logs(tmp_path)
     mark = tmp_path / "fit-mock_20261132T031500Z.mcap.keep"

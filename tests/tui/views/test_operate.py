@@ -13,6 +13,7 @@ from tests.tui.fixed import settle
 from tests.tui.piloted import pressed, run, sent
 
 
+@pytest.mark.long
 def test_a_target_is_put_with_the_cursor_and_confirmed():
     async def scenario(app, pilot):
         await pressed(app, pilot, "t", "right", "right", "up")
@@ -24,6 +25,7 @@ def test_a_target_is_put_with_the_cursor_and_confirmed():
     assert sent(run(scenario)) == [SetTarget(loop="right", az_px=25.0, el_px=20.0)]
 
 
+@pytest.mark.long
 def test_a_click_puts_the_cursor_and_moves_nothing_by_itself():
     async def scenario(app, pilot):
         await pilot.click(FocalPlane, offset=(10, 6))
@@ -48,6 +50,7 @@ def test_the_window_is_put_on_another_star_with_the_same_cursor():
     assert sent(run(scenario)) == [Look(loop="right", az_px=23.0, el_px=19.0)]
 
 
+@pytest.mark.long
 def test_the_mouse_alone_puts_the_window_on_another_star():
     async def scenario(app, pilot):
         await pilot.click(FocalPlane, offset=(10, 6))
@@ -99,6 +102,7 @@ def test_the_siderostat_is_jogged_by_arrow_keys_with_a_choice_of_steps():
     ]
 
 
+@pytest.mark.long
 def test_the_mirror_is_put_off_its_bias_and_back():
     async def scenario(app, pilot):
         await pressed(app, pilot, "j", "tab", "left")
@@ -111,6 +115,7 @@ def test_the_mirror_is_put_off_its_bias_and_back():
     ]
 
 
+@pytest.mark.long
 def test_a_mode_that_allows_no_jog_takes_the_stage_out_of_the_operators_hand():
     async def scenario(app, pilot):
         await pressed(app, pilot, "j")
@@ -123,6 +128,7 @@ def test_a_mode_that_allows_no_jog_takes_the_stage_out_of_the_operators_hand():
     assert sent(run(scenario, "STANDBY")) == []
 
 
+@pytest.mark.long
 def test_nothing_is_jogged_by_old_data():
     async def scenario(app, pilot):
         await pressed(app, pilot, "j")

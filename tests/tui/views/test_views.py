@@ -142,6 +142,7 @@ def test_the_smallest_and_the_largest_terminal_show_every_screen(size):
     run(scenario, size=size)
 
 
+@pytest.mark.long
 def test_the_arrows_of_a_list_in_the_footer_are_buttons():
     async def scenario(app, pilot):
         await pressed(app, pilot, "2")
@@ -155,6 +156,7 @@ def test_the_arrows_of_a_list_in_the_footer_are_buttons():
 
 
 @pytest.mark.parametrize("opening", [("o",), ("v",), ("e",), ("ctrl+p",)])
+@pytest.mark.long
 def test_stop_is_a_bright_button_at_the_top_right_of_every_dialog(opening):
     async def scenario(app, pilot):
         await pressed(app, pilot, *opening)
