@@ -37,7 +37,7 @@ $(READY): requirements/pip.lock requirements/dev.lock pyproject.toml
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements/pip.lock
 	@$(BIN)/python -m pip install --quiet --no-deps --no-compile --require-hashes -r requirements/dev.lock
 	@$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation -e .
-	@$(BIN)/python -m compileall -q -j 0 $(VENV)/lib
+	@$(BIN)/python -m compileall -qq -j 0 $(VENV)/lib || true  # a package may have files for other Pythons
 	@touch $(READY)
 
 demo: $(READY)  ## Run the whole instrument on mock devices

@@ -113,7 +113,7 @@ USABLE = {
 }
 
 _EL_PX, _AZ_PX = np.mgrid[0:SIZE_PX, 0:SIZE_PX]
-_made: dict[tuple[int, bytes], tuple[list[Telemetry], bytes]] = {}
+_made: dict[tuple[type, int, bytes], tuple[list[Telemetry], bytes]] = {}
 
 
 def spot_image(rng: np.random.Generator, spots: list[tuple[float, float, float]]) -> np.ndarray:
@@ -194,7 +194,7 @@ class FakeSupervisor:
 
     def messages(self, count: int) -> list[Telemetry]:
         """Made once for supervisors in the same state: most tests of the console begin with the same."""
-        key = count, pickle.dumps(vars(self))
+        key = type(self), count, pickle.dumps(vars(self))
         if key not in _made:
             messages = [self.message() for _ in range(count)]
             while len(_made) >= 20:
