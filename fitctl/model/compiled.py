@@ -24,6 +24,7 @@ _PACKAGES = Path(__file__).parents[2]
 _IMPORT = re.compile(rb"^(?:from|import) (fitctl[\w.]*)(?: import (\([^)]*\)|.*))?", re.M)
 _options: dict[Callable[..., Any], dict[str, Any]] = {}  # of all marked functions
 _COMPILES_S = 300.0  # the longest takes a slow computer half of that
+_SAVES_S = 10.0
 _registered: set[Callable[..., Any]] = set()  # with numba
 
 
@@ -83,7 +84,7 @@ def compiled(function: _Function) -> _Function:
     folder = cache_folder(function.__module__)
     given, config.CACHE_DIR = config.CACHE_DIR, str(folder)
     try:
-        return _compiled_by_one_at_a_time(njit(cache=True, **options)(function), folder / "lock")
+        return _compiled_once(njit(cache=True, **options)(function), folder)
     except RuntimeError:  # the folder cannot be written: each process compiles anew
         return njit(**options)(function)
     finally:
@@ -99,29 +100,32 @@ def _of_its_layout(kind: Any) -> tuple[str, tuple[int]]:
     return "Record", (int.from_bytes(hashlib.sha256(kind.name.encode()).digest()[:7]),)
 
 
-def _compiled_by_one_at_a_time(made: Any, lock: Path) -> Any:
-    """Lock the folder of machine code while a process compiles and saves; those that wait load what it saved.
+def _compiled_once(made: Any, folder: Path) -> Any:
+    """Of processes that need the same code one compiles it, and the others load it; one saves at a time.
 
     Numba names files by number: the first that its index lacks. Two processes that save code for different
     arguments at once would give both one name, and then run each other's code.
     """
-    from numba.core.caching import NullCache
+    compile_overload, save_overload = made.compile, made._cache.save_overload
 
-    compile_overload = made.compile
-
-    def compile_alone(signature: Any) -> Any:
-        with lock.open("a") as held:  # until the file is closed
-            if not _locked(held):
-                made._cache = NullCache()  # the other does not go on, and may save when it does
+    def compile_once(signature: Any) -> Any:
+        arguments = hashlib.sha256(str(signature).encode()).hexdigest()[:12]
+        with (folder / f"{arguments}.lock").open("a") as held:  # until the file is closed
+            _locked(held, _COMPILES_S)  # or the other does not go on, and both compile
             return compile_overload(signature)
 
-    made.compile = compile_alone
+    def save_alone(signature: Any, data: Any) -> None:
+        with (folder / "saving.lock").open("a") as held:
+            if _locked(held, _SAVES_S):
+                save_overload(signature, data)
+
+    made.compile, made._cache.save_overload = compile_once, save_alone
     return made
 
 
-def _locked(file: IO[str]) -> bool:
-    """Whether a lock could be had within `_COMPILES_S`."""
-    until_s = time.monotonic() + _COMPILES_S
+def _locked(file: IO[str], within_s: float) -> bool:
+    """Whether a lock could be had in time."""
+    until_s = time.monotonic() + within_s
     while time.monotonic() < until_s:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

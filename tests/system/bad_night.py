@@ -101,7 +101,7 @@ def fail_the_drive(night):
     """A drive's fault: read, acknowledged, looked at from five seconds before it, and recovered from."""
     screen = night.screen
     night.fault("set", "right.drive", "following_error", "--part", "az", "--for", "1")
-    screen.until("✗ SAFE", "following error", "▸ ", "then recover", "k Acknowledge")
+    screen.until("✗ SAFE", "following error", "▸ remove", "then recover", "k Acknowledge")
     time.sleep(2.0)
     night.keep("fault")
     screen.press("2")
@@ -125,7 +125,7 @@ def fail_the_drive(night):
     night.keep("acknowledged")
     screen.press("r")
     night.reach("STANDBY", "right")
-    screen.until_gone("following error")
+    screen.until_gone("▸ remove")  # the alarm; its words stay among the events
     screen.press("a")
     night.reach("VERNIER", "right")
     screen.until("◆ VERNIER")
