@@ -23,9 +23,9 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 _PACKAGES = Path(__file__).parents[2]
 _IMPORT = re.compile(rb"^(?:from|import) (fitctl[\w.]*)(?: import (\([^)]*\)|.*))?", re.M)
 _options: dict[Callable[..., Any], dict[str, Any]] = {}  # of all marked functions
+_registered: set[Callable[..., Any]] = set()  # with numba
 _COMPILES_S = 300.0  # the longest takes a slow computer half of that
 _SAVES_S = 10.0
-_registered: set[Callable[..., Any]] = set()  # with numba
 
 
 def compilable(*, inline: bool = False, fused: bool = False) -> Callable[[_Function], _Function]:
@@ -73,8 +73,6 @@ def compiled(function: _Function) -> _Function:
     config: Any = module  # its options are made when it is imported
     kinds: Any = types
     kinds.Record.mangling_args = property(_of_its_layout)
-    # Numba writes out all arguments at each of its passes; their names are at hand.
-    kinds.Record.__repr__ = kinds.NestedArray.__repr__ = kinds.Type.__str__
     for marked in _options.keys() - _registered:
         register_jitable(**_options[marked])(marked)
     _registered.update(_options)
@@ -111,7 +109,7 @@ def _compiled_once(made: Any, folder: Path) -> Any:
     def compile_once(signature: Any) -> Any:
         arguments = hashlib.sha256(str(signature).encode()).hexdigest()[:12]
         with (folder / f"{arguments}.lock").open("a") as held:  # until the file is closed
-            _locked(held, _COMPILES_S)  # or the other does not go on, and both compile
+            _locked(held, _COMPILES_S)  # in vain: the other stands still, and this one compiles too
             return compile_overload(signature)
 
     def save_alone(signature: Any, data: Any) -> None:

@@ -208,9 +208,7 @@ def step_creeping_run(
     while row < rows:
         end = min(rows, row + c.creep_steps - (first + row) % c.creep_steps)
         step_run(c, s, origin_px, air_px[row:end], spot_px[row:end])
-        at_m = stack_piston_m(s)
-        for step in range(row, end):  # not a slice: numba takes seconds to compile it
-            piston_m[step] = at_m
+        piston_m[row:end] = stack_piston_m(s)
         creep(c, s, first + row, end - row)
         row = end
 
@@ -267,9 +265,7 @@ def advance(
                 c, s, origin_px[run, 0], air_px[air_from : air_from + steps, run, 0],
                 trace_px[trace_from : trace_from + steps, run, 0],
             )  # fmt: skip
-            at_m = stack_piston_m(s)
-            for step in range(steps):
-                piston_m[step] = at_m
+            piston_m[:] = stack_piston_m(s)
         for spot in range(1, trace_px.shape[2]):
             for axis in range(2):
                 apart_px = origin_px[run, spot, axis] - origin_px[run, 0, axis]

@@ -7,6 +7,7 @@ the first message, wall time is a winter night.
 
 from __future__ import annotations
 
+import functools
 import pickle
 
 import numpy as np
@@ -113,7 +114,6 @@ USABLE = {
 }
 
 _EL_PX, _AZ_PX = np.mgrid[0:SIZE_PX, 0:SIZE_PX]
-_made: dict[tuple[type, int, bytes], tuple[list[Telemetry], bytes]] = {}
 
 
 def spot_image(rng: np.random.Generator, spots: list[tuple[float, float, float]]) -> np.ndarray:
@@ -194,13 +194,7 @@ class FakeSupervisor:
 
     def messages(self, count: int) -> list[Telemetry]:
         """Made once for supervisors in the same state: most tests of the console begin with the same."""
-        key = type(self), count, pickle.dumps(vars(self))
-        if key not in _made:
-            messages = [self.message() for _ in range(count)]
-            while len(_made) >= 20:
-                del _made[next(iter(_made))]
-            _made[key] = messages, pickle.dumps(vars(self))
-        messages, left = _made[key]
+        messages, left = _made(type(self), pickle.dumps(vars(self)), count)
         vars(self).update(pickle.loads(left))
         return list(messages)
 
@@ -584,3 +578,12 @@ def _timing(loop: str, now_s: float) -> LoopTiming:
         stalls=0,
         worst_stall_s=0.0,
     )
+
+
+@functools.lru_cache(maxsize=20)
+def _made(kind: type[FakeSupervisor], state: bytes, count: int) -> tuple[list[Telemetry], bytes]:
+    """The next messages of a supervisor in such a state, and its state after them."""
+    supervisor = kind.__new__(kind)
+    vars(supervisor).update(pickle.loads(state))
+    messages = [supervisor.message() for _ in range(count)]
+    return messages, pickle.dumps(vars(supervisor))

@@ -209,10 +209,7 @@ def find(ss: Any, rr: Any, ww: Any, i: int, frame_dn: Floats, search_dn: Floats)
         s.bias_dn, r.noise_dn, s.photon_dn, s.full_dn, r.pixel_key, r.frames, s.quantiles, s.light,
         search_dn[:, 0], search_dn[0],
     )  # fmt: skip
-    height, width = search_dn.shape
-    for row in range(height):  # here and below no slices: numba takes seconds to compile them
-        for column in range(width):
-            search_dn[row, column] = frame_dn[row, column]
+    search_dn[:] = frame_dn
     for _ in range(MAX_CANDIDATES):
         el, az = divmod(np.argmax(search_dn), s.width_px)
         if search_dn[el, az] - s.bias_dn < s.sensor.threshold_dn:
@@ -235,10 +232,8 @@ def find(ss: Any, rr: Any, ww: Any, i: int, frame_dn: Floats, search_dn: Floats)
             if away_px < nearest_px and may_be_own(r, az_px, el_px, near_az_px, near_el_px):
                 accept(r, az_px, el_px, flux)
                 nearest_px = away_px
-        left, right = max(0, az - HALF_WINDOW_PX), min(width, az + HALF_WINDOW_PX + 1)
-        for row in range(max(0, el - HALF_WINDOW_PX), min(height, el + HALF_WINDOW_PX + 1)):
-            for column in range(left, right):
-                search_dn[row, column] = 0.0
+        top, left = max(0, el - HALF_WINDOW_PX), max(0, az - HALF_WINDOW_PX)
+        search_dn[top : el + HALF_WINDOW_PX + 1, left : az + HALF_WINDOW_PX + 1] = 0.0
 
 
 @compilable()

@@ -177,7 +177,7 @@ def _table(timing: LoopTiming, unsent: int, columns: int) -> list[Line]:
 def _counts(timing: LoopTiming, unsent: int, columns: int) -> Line:
     """What went wrong: in the last second; frames and what no console was sent since the start.
 
-    If there is no room for all counts, it leaves out those that are 0.
+    A line too short for all counts leaves out those that are 0.
     """
     counts = [
         ("late", timing.late_ticks),
