@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from ipaddress import ip_address
+from pathlib import Path
 from typing import Annotated, Literal, get_args
 
 from pydantic import Field, field_validator, model_validator
 
 from fitctl.config.base import (
     AxisPair,
+    ConfigError,
     Count,
     Finite,
     Fraction,
@@ -287,6 +289,15 @@ class Logging(Settings):
     rotate_s: Annotated[float, Field(ge=1, le=31_536_000)]
     retain_bytes: Count
     retain_days: Annotated[float, Field(gt=0, le=36_500)]
+
+    @property
+    def folder_path(self) -> Path:
+        """The folder, in which ``~`` is somebody's home; ConfigError if nobody knows that user."""
+        try:
+            return Path(self.folder).expanduser()
+        except RuntimeError as error:
+            msg = f"logging.folder: {self.folder!r}: {error}; choose another"
+            raise ConfigError(msg) from None
 
     @model_validator(mode="after")
     def _room_to_write(self) -> Logging:

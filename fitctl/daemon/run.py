@@ -120,7 +120,7 @@ def run_supervisor(
         one of its devices.
     """
     service_folder(rig)  # refused before anything is made
-    log_folder = Path(rig.logging.folder).expanduser()
+    log_folder = rig.logging.folder_path
     check_log_folder(log_folder)
     folder = make_service_folder(rig)
     with ExitStack() as stack:

@@ -23,6 +23,7 @@ from fitctl.drivers.modbus import (
     pop_answer,
 )
 
+_MOST_UNASKED = 100  # answers: whoever waits for the last of those that come must get there
 _SO_TIMESTAMPNS = 35  # of Linux; not in Python's socket module
 _TIMESPEC = struct.Struct("@ll")
 _STAMP_BYTES = socket.CMSG_SPACE(_TIMESPEC.size)
@@ -74,6 +75,7 @@ class ModbusLink:
         self._keys = keys
         self._pending = bytearray()
         self._transaction = 0
+        self._owed = 0  # requests without an answer; negative after answers that nobody asked for
         try:
             self._socket = socket.create_connection((host, port), timeout_s)
         except (OSError, UnicodeError) as error:  # UnicodeError: a host that is no name at all
@@ -101,6 +103,7 @@ class ModbusLink:
             self._socket.sendall(TCP.buildFrame(request))
         except OSError as error:
             raise self._broken(str(error)) from error
+        self._owed += 1
         return self._transaction
 
     def receive(self, deadline_s: float) -> Answer | None:
@@ -116,6 +119,9 @@ class ModbusLink:
             except ValueError as error:
                 raise self.nonsense("a Modbus header", str(error)) from None
             if answer is not None:
+                self._owed -= 1
+                if self._owed < -_MOST_UNASKED:
+                    raise self.nonsense("one answer to a request", "more, without end")
                 return answer
             try:
                 data = self._read()

@@ -23,7 +23,7 @@ from mcap.writer import Writer
 
 from fitctl.files import replaced_whole
 from fitctl.logging.errors import LogError
-from fitctl.logging.files import COPY, DAMAGE, Described, opened
+from fitctl.logging.files import COPY, DAMAGE, RECOVERED, Described, opened
 from fitctl.logging.folder import in_use
 
 # A recorder that dies leaves a quarter of logging.queue_records unconfirmed, and that is a million at the most.
@@ -131,13 +131,13 @@ class _Target:
         self._channels: dict[tuple[str, str, int], int] = {}
 
     @contextlib.contextmanager
-    def writing(self) -> Iterator[None]:
-        """Write inside; after an error no file is left."""
+    def writing(self, **about: str) -> Iterator[None]:
+        """Write inside; after an error no file is left. `about` is what the metadata of a copy has beside."""
         try:
             with replaced_whole(self.path) as file:
                 self._mcap = Writer(file, enable_data_crcs=True, use_summary_offsets=False)
                 self._mcap.start(library="fitctl")
-                self.add(Metadata(COPY, {"by": "fitctl log"}))
+                self._mcap.add_metadata(COPY, {"by": "fitctl log", **about})
                 yield
                 self._mcap.finish()
         except OSError as error:
@@ -147,6 +147,8 @@ class _Target:
     def add(self, entry: _Copied | Metadata) -> None:
         """Copy one entry; metadata that is there already is not added again, and log times never go back."""
         if isinstance(entry, Metadata):
+            if entry.name == COPY:  # is of the source, not of this file
+                return
             known = entry.name, tuple(sorted(entry.metadata.items()))
             if known not in self._metadata:
                 self._metadata.add(known)
@@ -211,7 +213,7 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
         If there is nothing to save, the source is no log, or the target exists or cannot be written.
     """
     reading, writing = _Source(source), _Target(target, overwrite=overwrite)
-    with writing.writing():
+    with writing.writing(**{RECOVERED: source.name}):
         for entry in reading.entries():
             writing.add(entry)
         if not writing.records:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fitctl.logging.errors import LogError, NoLogError
-from fitctl.logging.files import COPY
+from fitctl.logging.files import COPY, RECOVERED
 from fitctl.logging.reading import LogInfo, log_info
 
 
@@ -55,9 +55,10 @@ def newest_run(folder: Path, rig: str | None = None) -> list[Path]:
 def find_newest(folder: Path, rig: str | None = None) -> NewestRun:
     """The newest run of a rig, as ``--latest`` chooses it, and what cannot be read beside it.
 
-    Names are not compared: a log counts by its first record, whatever its file is called. What `fitctl log`
-    cut or recovered counts only where none of the run's own files is left; a log that it merged from several
-    runs does not count, nor does a file that cannot be read.
+    Names are not compared: a log counts by its first record, whatever its file is called. A file that cannot
+    be read does not count; what `fitctl log recover` saved of it counts in its place. Otherwise, what
+    `fitctl log` cut or recovered counts only where none of the run's own files is left, and a log that it
+    merged from several runs does not count.
 
     Parameters
     ----------
@@ -81,11 +82,13 @@ def find_newest(folder: Path, rig: str | None = None) -> NewestRun:
         for log in readable
         if log.counts and log.runs <= 1 and "rig" in log.metadata and rig in {None, rig_name(log)}
     ]
+    saved = {_recovered_from(log) for log in readable} & {path.name for path in problems}
     run = [log for log in logs if run_of(log) == run_of(logs[-1])]
-    files = [log.path for log in recorded(run)]
+    files = [log.path for log in _without_copies(run, saved)]
     last_s = max(map(_written_s, files), default=math.inf)
     for path, problem in problems.items():
-        if not isinstance(problem, NoLogError) and _written_s(path) > last_s:
+        may_be_newest = _written_s(path) > last_s and path.name not in saved
+        if may_be_newest and not isinstance(problem, NoLogError):
             msg = f"{problem}. It was written after {files[-1]}, so the newest run may be in it; name a LOG"
             raise LogError(msg)
     return NewestRun(files, tuple(map(str, problems.values())))
@@ -98,6 +101,14 @@ def _written_s(path: Path) -> float:
         return -math.inf
 
 
-def recorded(run: list[LogInfo]) -> list[LogInfo]:
-    """The logs of a run that its recorders wrote; where only copies are left that `fitctl log` made, these."""
-    return [log for log in run if COPY not in log.metadata] or run
+def _without_copies(run: list[LogInfo], saved: set[str]) -> list[LogInfo]:
+    """The logs of a run that its recorders wrote, and what was recovered of files that cannot be read.
+
+    Where only other copies are left that `fitctl log` made, these.
+    """
+    kept = [log for log in run if COPY not in log.metadata or _recovered_from(log) in saved]
+    return kept or run
+
+
+def _recovered_from(log: LogInfo) -> str:
+    return log.metadata.get(COPY, {}).get(RECOVERED, "")

@@ -160,7 +160,8 @@ class SeekableLog:
                 newest.channels.add(channel)
                 if channel not in self._channels and newest is not unpacked:  # each chunk once
                     unpacked = newest
-                    self._learn_channels(self._unpack(stream, newest))
+                    with contextlib.suppress(*DAMAGE):  # is counted when it is read
+                        self._learn_channels(self._unpack(stream, newest))
             elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
                 self._learn_channels(head + stream.read(min(size, MOST_METADATA_BYTES)))
             elif opcode == Opcode.METADATA and metadata_bytes + size <= MOST_METADATA_BYTES:

@@ -58,13 +58,18 @@ class BeamTally:
 
     Attributes
     ----------
+    ticks, late_ticks : int
+        Those whose frame came; those whose command came late.
     samples : int
         Of the photodiodes that measured the beam.
     az_arcsec2, el_arcsec2 : float
         Squared errors of the beam, summed over `samples`.
     newest : MetrologyTick or None
+        The last tick, with a frame or without.
     """
 
+    ticks: int = 0
+    late_ticks: int = 0
     samples: int = 0
     az_arcsec2: float = 0.0
     el_arcsec2: float = 0.0
@@ -73,6 +78,9 @@ class BeamTally:
     def add(self, tick: MetrologyTick) -> None:
         """Add one tick."""
         self.newest = tick
+        if tick.number >= 0:
+            self.ticks += 1
+            self.late_ticks += tick.late
         if tick.beam_state == BEAM_MEASURED:
             self.samples += 1
             self.az_arcsec2 += tick.beam_az_arcsec**2

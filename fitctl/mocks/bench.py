@@ -196,9 +196,7 @@ class FaultTable:
         except UnknownFault as error:
             return FaultsNow([], str(error))
         except ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join(map(str, first["loc"]))
-            return FaultsNow([], f"{where}: {must_be(first)} (is {first['input']})")
+            return FaultsNow([], _wrong(error))
         active = [fault for faults in self._devices.values() for fault in faults.active]
         return FaultsNow([ActiveFault(**fault.model_dump(exclude={"at_s"})) for fault in active])
 
@@ -335,11 +333,14 @@ class Bench:
             part.history_px(*span_s)[::_VISIBILITY_EVERY, 0, 0] - np.array(target)
             for part, target in zip((one, other), question.targets_px, strict=True)
         )
-        fringes = Fringes(
-            loops=list(question.loops),
-            aperture_m=question.aperture_m,
-            wavelength_m=question.wavelength_m,
-        )
+        try:
+            fringes = Fringes(
+                loops=list(question.loops),
+                aperture_m=question.aperture_m,
+                wavelength_m=question.wavelength_m,
+            )
+        except ValidationError as error:
+            return Visibility(np.nan, _wrong(error))
         tilt_rad = (one_px - other_px) / one.constants.sky_px_per_rad
         return Visibility(mean_visibility(tilt_rad, fringes))
 
@@ -348,6 +349,12 @@ class Bench:
     ) -> tuple[float, float]:
         """In the plant's time."""
         return question.start_s - self._started_s, question.end_s - self._started_s
+
+
+def _wrong(error: ValidationError) -> str:
+    first = error.errors()[0]
+    where = ".".join(map(str, first["loc"]))
+    return f"{where}: {must_be(first)} (is {first['input']})"
 
 
 def _times(question: ResidualQuestion | BeamQuestion | VisibilityQuestion) -> bool:

@@ -7,6 +7,7 @@ the link's own siderostat and by the collector bench.
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -67,6 +68,7 @@ class StellarPart(Part):
         self.pixel_keys = [stream.pixels for stream in streams]
         self._air_px = np.empty((timeline.block_steps, runs, spots, 2))
         self._epochs = self.constants.epochs
+        self._from_nodes = [epoch.from_node for epoch in self._epochs]
         self._air = Air(
             [(epoch.from_node, epoch.air) for epoch in self._epochs],
             [stream.air for stream in streams],
@@ -92,7 +94,7 @@ class StellarPart(Part):
     def begin_block(self) -> None:
         """Draw the air path, and what drives the lines; the star moves."""
         self._air.draw()
-        for number, begin, end in pieces([e.from_node for e in self._epochs], self._nodes):
+        for number, begin, end in pieces(self._from_nodes, self._nodes):
             if len(self._epochs[number].lines):
                 self._add_lines(self._epochs[number], begin, end)
         if self.constants.star_rate_px_s.any():
@@ -122,7 +124,7 @@ class StellarPart(Part):
     def _begin_epoch(self, first: int) -> None:
         """From the step `first` on stacks may have another hysteresis; where they are, they stay."""
         node = first // len(self.constants.air.weights)
-        number = sum(epoch.from_node <= node for epoch in self._epochs) - 1
+        number = bisect_right(self._from_nodes, node) - 1
         if number != self._epoch:
             before, gains = (self._epochs[n].play_gain_m_per_v for n in (self._epoch, number))
             self.state.carried_m[:] += self.state.plays_v @ (before - gains)

@@ -125,8 +125,8 @@ class LoggedCamera(NoDevice):
             None,
         )
         self._frames.clear()
-        if step.frame is not None:
-            tick = next(tick for tick in step.ticks.values() if is_stellar(tick))
+        tick = next(filter(is_stellar, step.ticks.values()), None)
+        if step.frame is not None and tick is not None:  # its tick may be among the lost records
             exposed_s = tick.mid_exposure_s
             # To the last bit: the age was had by subtracting times that lie close together.
             received_s = exposed_s + tick.frame_age_s

@@ -30,6 +30,7 @@ _TERMINAL_BINS = 400
 _COLOURS = ("blue", "orange", "green", "magenta", "cyan", "red")
 _MOST_PIECES = 40
 _LEAST_LINES = 12  # of a panel
+_TICKS = ("/tick", "/metrology")  # as the topics of ticks end
 UNITS = ("px", "v", "s", "rad", "arcsec", "dn", "fraction", "progress", "ns")
 
 
@@ -137,12 +138,12 @@ _Modes = dict[str, tuple[NDArray[np.int64], NDArray[np.int64]]]
 
 def _modes(path: Path, info: LogInfo) -> _Modes:
     """Of each loop, as its ticks say: times in UTC, nanoseconds since 1970, and modes by number."""
-    topics = [topic for topic in info.counts if topic.endswith("/tick")]
+    topics = [topic for topic in info.counts if topic.endswith(_TICKS)]
     parts: dict[str, list[tuple[Any, Any]]] = defaultdict(list)
     for topic, columns in column_blocks(
         path, topics, _ROWS, {topic: ["mode_number"] for topic in topics}
     ):
-        loop = topic.removesuffix("/tick")
+        loop = topic.rpartition("/")[0]
         parts[loop].append((columns["publish_time_ns"], columns["mode_number"]))
     return {
         loop: (np.concatenate([each[0] for each in its]), np.concatenate([each[1] for each in its]))

@@ -83,8 +83,8 @@ def _beam_row(tick: MetrologyTick, sky_arcsec_per_px: float) -> tuple[float, ...
     """A metrology tick in the columns of `TICK_FIELDS`: the beam's error in the camera's pixels, no mirror."""
     return (
         tick.time_s,
-        -tick.beam_az_arcsec / sky_arcsec_per_px,
-        -tick.beam_el_arcsec / sky_arcsec_per_px,
+        tick.beam_az_arcsec / sky_arcsec_per_px,
+        tick.beam_el_arcsec / sky_arcsec_per_px,
         math.nan,
         math.nan,
         tick.frame_age_s,

@@ -9,7 +9,7 @@ from pymodbus.pdu import ReadHoldingRegistersRequest
 from scripted_server import scripted_server
 
 from fitctl.drivers.endpoint import Endpoint
-from fitctl.drivers.interface import DeviceUnreachable
+from fitctl.drivers.interface import DeviceProtocolError, DeviceUnreachable
 from fitctl.drivers.modbus_tcp import ModbusLink
 from fitctl.mocks.modbus.tcp import frame
 
@@ -78,3 +78,30 @@ def test_a_station_that_reads_nothing_is_unreachable_and_nobody_waits_for_it():
         with pytest.raises(DeviceUnreachable, match="check the power and the cable of the station"):
             send_until_full(link, took_s)
     assert max(took_s) < 0.2  # with a wait it would be the link's 0.25 s
+
+
+def answer_without_end(client):
+    while True:
+        client.sendall(frame(0xFFFF, 1, bytes.fromhex("03 02 00 07")))
+
+
+def test_a_station_that_answers_without_end_is_given_up():
+    with scripted_server(answer_without_end) as port:
+        link = link_to(port)
+        with pytest.raises(DeviceProtocolError, match="one answer to a request, got more"):
+            link.ask(request())
+
+
+def test_answers_that_all_come_late_are_none_too_many():
+    def answer_late(client):
+        numbers = [client.recv(12)[:2] for _ in range(300)]
+        for number in numbers:
+            client.sendall(frame(int.from_bytes(number, "big"), 1, bytes.fromhex("03 02 00 07")))
+        client.recv(1)
+
+    with scripted_server(answer_late) as port:
+        link = link_to(port)
+        sent = [link.send(request()) for _ in range(300)]
+        received = [link.receive(time.monotonic() + 5.0).transaction for _ in range(300)]
+        link.close()
+    assert received == sent

@@ -20,7 +20,7 @@ from samples.log_samples import (
 
 from fitctl.logging.copying import cut, merge, recover
 from fitctl.logging.errors import LogError
-from fitctl.logging.files import COPY
+from fitctl.logging.files import COPY, RECOVERED
 from fitctl.logging.reading import log_info, read_records
 from fitctl.logging.verifying import verify
 from fitctl.logging.writer import LogWriter
@@ -111,7 +111,8 @@ def test_one_damaged_chunk_costs_its_own_records_only(whole):
 def test_the_runs_description_is_recovered_too(whole):
     path, _ = whole
     recovered(path, path.read_bytes()[:20_000])
-    assert log_info(path.with_name("recovered.mcap")).metadata == log_info(path).metadata | COPIED
+    described = log_info(path.with_name("recovered.mcap")).metadata
+    assert described == log_info(path).metadata | {COPY: COPIED[COPY] | {RECOVERED: "broken.mcap"}}
 
 
 def test_a_log_without_a_whole_record_is_refused_and_nothing_is_left(tmp_path):

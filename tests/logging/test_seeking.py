@@ -85,6 +85,19 @@ def test_a_damaged_chunk_is_left_out_and_counted(path):
     assert 0 < COUNT - len(found) < 200
 
 
+def test_damage_in_the_first_chunk_costs_that_chunk_only(path):
+    first = SeekableLog(path)._chunks[0]
+    content = bytearray(path.read_bytes())
+    content[first.offset + first.size // 2] ^= 0xFF
+    path.write_bytes(content)
+
+    log = SeekableLog(path)
+    found = numbers(log, 0, COUNT)
+
+    assert log.damaged == 1
+    assert 0 < COUNT - len(found) < 200
+
+
 def test_other_topics_are_passed_over_without_unpacking(path):
     log = SeekableLog(path)
     log._unpack = None

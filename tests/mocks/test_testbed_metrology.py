@@ -190,6 +190,9 @@ def test_the_bench_knows_beam_and_visibility_and_where_it_does_not_says_why(runn
     )
     nobody = VisibilityQuestion(("left", "nobody"), targets, 0.15, 7e-7, 0.0, 1.0)
     assert "no two loops are named left, nobody" in ask_bench(port, nobody, Visibility).error
+    no_aperture = VisibilityQuestion(("left", "right"), targets, -0.15, 7e-7, since_s, since_s)
+    assert "aperture_m: must be " in ask_bench(port, no_aperture, Visibility).error
+    assert ask_bench(port, BeamQuestion(LOOP, since_s, since_s + 0.15), Beam).samples > 0
 
 
 def test_doctor_asks_the_labjack_who_it_is(running, capsys):

@@ -247,6 +247,18 @@ def test_one_voltage_of_one_photodiode_shows_in_the_beam_s_place_and_the_set_poi
     assert metrology.differences["siderostat_setpoint_rad"].first_s == changed[0]
 
 
+@pytest.mark.long
+def test_a_frame_whose_stellar_ticks_were_lost_is_passed_over(logged):
+    def without_one_frames(record):
+        return None if isinstance(record, Tick) and record.number == 100 else record
+
+    rig = load_rig(RIG, [SOON, SOON_TOO])
+    path, _ = logged(hold_all, rig=rig, star_offset_px=STAR_PX, change=without_one_frames)
+    loops = replayed(path).loops
+
+    assert loops["right"].ticks == loops["left"].ticks == loops["metrology"].ticks - 1
+
+
 def test_a_log_of_a_fitctl_before_links_were_logged_is_refused(logged, monkeypatch):
     from google.protobuf.descriptor_pool import DescriptorPool
 

@@ -1,10 +1,11 @@
 import numpy as np
 import pytest
 from samples.forged_logs import forged_of, with_topic_of_another_program
-from samples.log_samples import RUN_INFO, frame, tick, write_log
+from samples.log_samples import RUN_INFO, filled, frame, tick, write_log
 
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import log_info, tick_arrays
+from fitctl.logging.records import MetrologyTick
 from fitctl.messages.modes import Mode
 from fitctl.report.quick import MOST_FIELDS, Series, as_figure, as_text, read_series
 
@@ -103,6 +104,19 @@ def test_a_topic_of_the_rig_is_read_while_any_loop_is_in_the_mode(held):
         for mode in (None, Mode.VERNIER)
     )
     assert 0 < len(vernier.values) < len(whole.values)
+
+
+def test_a_metrology_loop_s_mode_is_its_own(tmp_path):
+    modes = [Mode.LOCKED, Mode.VERNIER]  # the second is of no metrology loop
+    beams = [
+        filled(MetrologyTick, loop="metrology", time_s=100.0 + n, mode_number=mode)
+        for n, mode in enumerate(modes)
+    ]
+    path = write_log(tmp_path / "a.mcap", [RUN_INFO, *beams, tick(1, mode_number=Mode.LOCKED)])
+
+    (series,) = read_series(path, ["beam_az_arcsec"], mode=Mode.LOCKED)
+
+    assert len(series.values) == 1
 
 
 def test_a_mode_that_never_was_leaves_nothing(held):

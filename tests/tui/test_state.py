@@ -102,7 +102,7 @@ def test_a_metrology_loop_has_a_past_of_its_beam_in_the_cameras_pixels():
     assert state.loop.tick is None
     assert state.loop.beam == ticks[-1]
     errors = state.loop.errors(10.0)
-    assert errors[0] == pytest.approx([START_S + 0.1, -2.0, 1.0])
+    assert errors[0] == pytest.approx([START_S + 0.1, 2.0, -1.0])
     assert np.isnan(errors[1, 1:]).all()
 
 

@@ -64,7 +64,7 @@ def list_(rig: RigOption = None, overrides: SetOption = None, as_json: JsonOptio
 
     Reads the folder `logging.folder` of the rig file. Exit status 1 if a log in it cannot be read.
     """
-    where = Path(logging_rig("log list", rig, overrides).logging.folder)
+    where = logging_rig("log list", rig, overrides).logging.folder_path
     logs, problems = logs_in(where)
     if as_json:
         say(to_json([_listed(log) for log in logs]))

@@ -32,8 +32,9 @@ def plot(
         ),
     ],
     from_: Annotated[
-        str, typer.Option("--from", metavar="TIME", help="Seconds after LOG's start, or UTC.")
-    ] = "0",
+        str | None,
+        typer.Option("--from", metavar="TIME", help="Seconds after LOG's start, or UTC."),
+    ] = None,
     to: Annotated[
         str | None, typer.Option("--to", metavar="TIME", help="End of the plot, in the same form.")
     ] = None,
@@ -68,14 +69,15 @@ def plot(
     if not found.counts:
         msg = f"plot: {log} has no record, so there is nothing to plot; name another log"
         raise ConfigError(msg)
-    from_ns = time_ns("--from", from_, found)
+    # What waited for the recorder is older than the log's start.
+    from_ns = 0 if from_ is None else time_ns("--from", from_, found)
     to_ns = 2**63 - 1 if to is None else time_ns("--to", to, found)
     series = read_series(log, what, from_ns, to_ns, None if mode is None else _mode(mode))
     if not any(len(one.time_s) for one in series):
         in_mode = "" if mode is None else f" in mode {mode.upper()}"
         msg = (
-            f"plot: {log} has no values of {', '.join(what)}{in_mode} between --from {from_} and "
-            f"--to {to or 'its end'}"
+            f"plot: {log} has no values of {', '.join(what)}{in_mode} between --from "
+            f"{from_ or 'its start'} and --to {to or 'its end'}"
         )
         raise ConfigError(msg)
     for one in series:

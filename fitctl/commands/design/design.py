@@ -286,6 +286,11 @@ def _bound(rig: Rig, loop: str) -> Report:
         lines.append(
             f"  with the air path and the lines of plant.loops.{loop}, worst axis: {plant_px:.4f} px"
         )
+    changes_s = [at_s for at_s, _ in rig.plant.changes(loop)] if rig.plant is not None else []
+    if changes_s:
+        lines.append(
+            f"  before {changes_s[0]:g} s of plant.timeline; what changes then is not taken into account"
+        )
     return result | {"plant_residual_px": plant_px}, lines
 
 

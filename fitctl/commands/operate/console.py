@@ -81,7 +81,7 @@ def console(
         serve_console([*(arguments or ()), *remote_arguments], port)
         return
     # The logs of a rig elsewhere are elsewhere too.
-    log_folder = None if remote else Path(rig_of(rig, overrides).logging.folder).expanduser()
+    log_folder = None if remote else rig_of(rig, overrides).logging.folder_path
     app = ConsoleApp(
         client,
         quit_shuts_down=quitting_ends_instrument,
@@ -119,7 +119,7 @@ def commissioning_console(rig: Path, overrides: Sequence[str], options: Sequence
         clock=client.now_s,
         rig_arguments=arguments,
         commissioning=[*arguments, *options],
-        log_folder=Path(described.logging.folder).expanduser(),
+        log_folder=described.logging.folder_path,
         graphics=graphics_of(Graphics("auto"), os.environ),
     )
     _run(app, niceness=0)  # a step inherits it, and points the star

@@ -57,14 +57,14 @@ def _stars(results: list[StarResult]) -> list[str]:
     )
     lines = []
     for result in results:
-        shown = [f"{_figure(result, key):>9{form}}" for key, form in columns]
+        shown = [f"{_figure(result, key, form):>9}" for key, form in columns]
         lines.append(f"{result.name:<{width}}  {'  '.join(shown)}  {result.why_not}".rstrip())
-    return ["", head, *(line.replace("nan", "  -") for line in lines)]
+    return ["", head, *lines]
 
 
-def _figure(result: StarResult, key: str) -> float:
+def _figure(result: StarResult, key: str, form: str) -> str:
     value = result.figures.get(key)
-    return math.nan if value is None else value
+    return "-" if value is None or math.isnan(value) else f"{value:{form}}"
 
 
 def as_json_text(name: str, failure: str, attempts: list[SequenceAttempt]) -> str:

@@ -19,7 +19,7 @@ from fitctl.commands.shared.printing import say, to_json, utc
 from fitctl.commands.shared.supervisor import connect
 from fitctl.logging.records import Severity
 from fitctl.messages.modes import Mode
-from fitctl.messages.tally import Tally, add_ticks
+from fitctl.messages.tally import BeamTally, Tally, add_beam_ticks, add_ticks
 from fitctl.messages.telemetry import LoopState, Telemetry
 from fitctl.processes import ended_by_signals, interrupt
 
@@ -29,7 +29,10 @@ _SILENCE = "no telemetry from a supervisor; if none is running, start one: fitct
 
 
 class LoopSecond(msgspec.Struct, frozen=True, kw_only=True):
-    """One loop over a second; what no tick reports is NaN."""
+    """One loop over a second; what no tick reports is NaN.
+
+    Stars and the mirror are a stellar loop's, the beam is a metrology loop's.
+    """
 
     name: str
     mode: str
@@ -41,6 +44,9 @@ class LoopSecond(msgspec.Struct, frozen=True, kw_only=True):
     ticks: int
     late_ticks: int
     star_ticks: int
+    beam_samples: int
+    rms_az_arcsec: float
+    rms_el_arcsec: float
     star_lost: bool
     failed: str
 
@@ -125,6 +131,7 @@ def entries(
     begun_s = quiet_since_s = time.monotonic()
     due_s = math.inf
     tallies: dict[str, Tally] = {}
+    beams: dict[str, BeamTally] = {}
     newest: Telemetry | None = None
     while duration_s is None or time.monotonic() - begun_s < duration_s:
         why = ""
@@ -147,38 +154,46 @@ def entries(
                 message=event.message,
             )
         add_ticks(tallies, telemetry.ticks)
+        add_beam_ticks(beams, telemetry.metrology_ticks)
         if telemetry.time_s >= due_s:
-            yield _second(telemetry, tallies)
-            tallies = {}
+            yield _second(telemetry, tallies, beams)
+            tallies, beams = {}, {}
             due_s += _LINE_S * (1 + (telemetry.time_s - due_s) // _LINE_S)
         due_s = min(due_s, telemetry.time_s + _LINE_S)  # a supervisor's clock may have begun anew
         newest = telemetry
-    if newest is not None and tallies:
-        yield _second(newest, tallies)
+    if newest is not None and (tallies or beams):
+        yield _second(newest, tallies, beams)
 
 
-def _second(telemetry: Telemetry, tallies: dict[str, Tally]) -> Second:
+def _second(telemetry: Telemetry, tallies: dict[str, Tally], beams: dict[str, BeamTally]) -> Second:
     return Second(
         time=utc(telemetry, telemetry.time_s),
         rig=telemetry.rig_name,
-        loops=[_loop(loop, tallies.get(loop.name, Tally())) for loop in telemetry.loops],
+        loops=[
+            _loop(loop, tallies.get(loop.name, Tally()), beams.get(loop.name, BeamTally()))
+            for loop in telemetry.loops
+        ],
     )
 
 
-def _loop(loop: LoopState, tally: Tally) -> LoopSecond:
+def _loop(loop: LoopState, tally: Tally, beam: BeamTally) -> LoopSecond:
     az_px, el_px = tally.rms_px
-    newest = tally.newest
+    az_arcsec, el_arcsec = beam.rms_arcsec
+    stellar, newest = tally.newest, tally.newest or beam.newest
     return LoopSecond(
         name=loop.name,
         mode=loop.mode,
         interlocks=[row.name for row in loop.interlocks],
         rms_az_px=az_px,
         rms_el_px=el_px,
-        fsm_range_fraction=math.nan if newest is None else newest.fsm_range_fraction,
+        fsm_range_fraction=math.nan if stellar is None else stellar.fsm_range_fraction,
         search_progress=math.nan if newest is None else newest.search_progress,
-        ticks=tally.ticks,
-        late_ticks=tally.late_ticks,
+        ticks=tally.ticks + beam.ticks,
+        late_ticks=tally.late_ticks + beam.late_ticks,
         star_ticks=tally.star_ticks,
+        beam_samples=beam.samples,
+        rms_az_arcsec=az_arcsec,
+        rms_el_arcsec=el_arcsec,
         star_lost=loop.search_again is not None,
         failed="" if loop.last_failure is None else loop.last_failure.what,
     )
@@ -203,6 +218,8 @@ def _loop_text(loop: LoopSecond) -> str:
     elif loop.star_ticks:
         parts.append(f"RMS az {loop.rms_az_px:.4f} el {loop.rms_el_px:.4f} px")
         parts.append(f"mirror {loop.fsm_range_fraction:4.0%}")
+    elif loop.beam_samples:
+        parts.append(f"RMS az {loop.rms_az_arcsec:.3f} el {loop.rms_el_arcsec:.3f} arcsec")
     if loop.ticks:
         parts.append(f"{loop.ticks} frames, {loop.late_ticks} late")
     if loop.interlocks:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from pathlib import Path
 
 from fitctl.commands.shared.options import ParentOption, SetOption, ShippedRigOption
 from fitctl.commands.shared.rig import rig_of
@@ -40,7 +39,7 @@ def record(
                 sockets.endpoint(RECORDS_SOCKET),
                 settings.logging,
                 rig_name=settings.name,
-                folder=Path(settings.logging.folder).expanduser(),
+                folder=settings.logging.folder_path,
                 stop=stop,
                 on_status=report,
                 parent_pid=parent_pid,

@@ -51,7 +51,7 @@ def chosen_logs(
         msg = f"{command}: expected a LOG; name one, or give --latest for the newest log of the rig"
         raise ConfigError(msg)
     settings = logging_rig(command, rig)
-    folder = Path(settings.logging.folder)
+    folder = settings.logging.folder_path
     newest = find_newest(folder, settings.name)
     say_unreadable(newest.unreadable)
     if not newest.files:

@@ -10,7 +10,7 @@ from samples.log_samples import RUN_INFO, WALL_S, one_of_each, tick, write_log
 
 from fitctl.cli import main
 from fitctl.config import default_rig_path, load_rig
-from fitctl.logging.copying import merge
+from fitctl.logging.copying import merge, recover
 from fitctl.logging.listing import newest_run
 from fitctl.report.run import find_run
 
@@ -68,6 +68,14 @@ def test_list_has_every_log_of_the_folder_oldest_first(fitctl, logs):
     assert all(one["finished"] and not one["kept"] for one in listed)
 
 
+def test_a_folder_of_logs_in_somebody_s_home_is_found(fitctl, logs, monkeypatch):
+    monkeypatch.setenv("HOME", str(logs.parent))
+    at_home = ("--set", "logging.folder=~/logs")
+
+    assert "z.mcap" in fitctl("log", "list", *at_home)[1]
+    assert fitctl("log", "list", "--set", "logging.folder=~no-such-user/logs")[0] == 2
+
+
 def test_list_names_a_file_that_cannot_be_read(fitctl, logs):
     (logs / "torn.mcap").write_bytes(b"nothing of MCAP")
 
@@ -100,11 +108,20 @@ def test_copies_are_the_newest_run_only_where_none_of_its_own_files_is_left(fitc
     assert [one.path for one in find_run([logs], SHIPPED).logs] == [logs / "b_cut.mcap"]
 
 
+def test_a_plot_without_from_begins_with_what_waited_for_the_recorder(fitctl, logs, tmp_path):
+    waited = [tick(1, time_s=98.0), tick(2, time_s=100.0)]
+    late = write_log(tmp_path / "late.mcap", [RUN_INFO, *waited])
+
+    assert fitctl("plot", late, "error_az_px", "--to", "-1.0")[0] == 0
+    assert fitctl("plot", late, "error_az_px", "--from", "0", "--to", "-1.0")[0] == 2
+
+
 def test_latest_goes_before_the_topics_of_a_plot(fitctl, logs):
     by_name = fitctl("plot", "logs/b.mcap", "record*")
 
     assert fitctl("plot", "--latest", "record*") == by_name
-    assert "logs/b.mcap" in "".join(by_name[1:])
+    assert by_name[0] == 0
+    assert "after b.mcap" in by_name[1]
 
 
 @pytest.mark.parametrize(
@@ -237,6 +254,27 @@ def test_a_newer_log_that_cannot_be_read_is_not_passed_over_for_an_older_night(
     assert problem.count("\n") == 0
     assert problem.startswith("logs/b.mcap: ")
     assert "It was written after logs/z.mcap, so the newest run may be in it; name a LOG" in problem
+
+
+def test_what_was_recovered_counts_in_place_of_the_damaged_file(fitctl, logs):
+    (logs / "a.mcap").unlink()
+    os.utime(logs / "z.mcap", (1.0, 1.0))
+    damaged(logs / "b.mcap", written_s=2.0)
+    assert fitctl("log", "recover", "logs/b.mcap")[0] == 0
+    assert fitctl("log", "cut", "logs/b_recovered.mcap")[0] == 0
+
+    status, text, problems = fitctl("log", "info", "--latest")
+
+    assert status == 0
+    assert text.startswith("logs/b_recovered.mcap: ")
+    (line,) = problems.splitlines()
+    assert line.startswith("logs/b.mcap: ")
+
+
+def test_what_was_recovered_is_left_out_beside_the_file_itself(fitctl, logs):
+    assert recover(logs / "b.mcap", logs / "saved.mcap").records > 0
+
+    assert newest_run(logs, RIG) == [logs / "b.mcap"]
 
 
 @pytest.mark.long

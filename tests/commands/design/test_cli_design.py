@@ -106,6 +106,11 @@ def test_the_bound_of_the_plants_night(design, night, residual_px):
     )
 
 
+def test_the_bound_says_which_part_of_a_night_that_changes_it_is_of(design):
+    timeline = "plant.timeline=[{at_s=60.0, loops={right={loop_width_fraction=0.02}}}]"
+    assert "before 60 s of plant.timeline" in design("bound", "--set", timeline)[1]
+
+
 @pytest.mark.long
 def test_the_coarse_loop_and_what_its_play_does(design):
     found = json.loads(design("coarse", "--json")[1])

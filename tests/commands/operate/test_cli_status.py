@@ -297,6 +297,22 @@ def test_a_line_of_text_says_what_the_mode_needs(monkeypatch, mode):
     assert "nan" not in line
 
 
+@pytest.mark.parametrize("mode", ["ACQUISITION", "LOCKED"])
+def test_a_metrology_loop_has_its_ticks_and_its_beam_s_rms(monkeypatch, mode):
+    supervisor = FakeSupervisor(mode, loops=("metrology",))
+    messages = supervisor.messages(23)
+    second = next(each for each in watched(monkeypatch, messages) if isinstance(each, watch.Second))
+    (loop,) = second.loops
+    last_s = messages[0].time_s + 1.0
+    beams = [t for each in messages for t in each.metrology_ticks if t.time_s <= last_s]
+    line = watch._text(second)
+
+    assert loop.ticks == len(beams) > 0
+    assert ("RMS az" in line and "arcsec" in line) == (mode == "LOCKED")
+    assert ("searched" in line) == (mode == "ACQUISITION")
+    assert "nan" not in line
+
+
 def test_a_line_of_text_says_that_the_star_was_lost(monkeypatch):
     supervisor = FakeSupervisor("ACQUISITION")
     supervisor.search_again = STAR_LOST

@@ -1,10 +1,12 @@
 """What `fitctl sequence` prints of its attempts."""
 
+import msgspec
+
 from fitctl.commands.operate.sequence_text import attempts_text
 from fitctl.logging.records import SequenceAttempt
 
 
-def attempt(loop):
+def attempt(loop, **fields):
     return SequenceAttempt(
         time_s=1.0,
         sequence_name="acquire",
@@ -17,6 +19,7 @@ def attempt(loop):
         outcome="done",
         message="held",
         figures_json="{}",
+        **fields,
     )
 
 
@@ -28,6 +31,14 @@ def test_attempts_of_several_loops_name_their_loops():
         ["1", "acquire", "left"],
     ]
     assert {row.index("done") for row in rows} == {head.index("outcome")}
+
+
+def test_names_and_reasons_stay_whole_where_a_star_has_no_figures():
+    skipped = attempt("right", star="Menkalinan")
+    skipped = msgspec.structs.replace(skipped, outcome="failed", message="a resonance")
+    last = attempts_text([skipped]).splitlines()[-1]
+
+    assert last.split() == ["Menkalinan", "-", "-", "-", "-", "a", "resonance"]
 
 
 def test_attempts_of_one_loop_do_not():
