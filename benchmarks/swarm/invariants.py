@@ -400,7 +400,8 @@ class Invariants:
         name = change.loop
         if change.target == Mode.ACQUISITION.name:
             self.own_stars.searched(name)
-        if change.target == Mode.SAFE.name and change.source != Mode.SAFE.name:
+        is_safe = change.target == Mode.SAFE.name and change.source != Mode.SAFE.name
+        if is_safe or (change.target == Mode.OFF.name and self._all_others_are_off(name)):
             self._collector_is_to_stop(is_so=True)
         if change.target == Mode.STANDBY.name and change.source in {"OFF", "SAFE"}:
             self.motion.stopped_s.pop(name, None)
@@ -411,6 +412,10 @@ class Invariants:
             self.violated("an axis that is not stuck is not called so", f"{name}: {change.reason}")
         if change.trigger == Trigger.FAULT.name and not self._has_cause(name, change.reason):
             self.violated("without a fault nothing fails", f"{name}: {change.reason}")
+
+    def _all_others_are_off(self, name: str) -> bool:
+        loops = self._supervisor.loops if self._supervisor else {}
+        return all(loop.mode is Mode.OFF for other, loop in loops.items() if other != name)
 
     def struck(self, device: str) -> None:
         """Something happens to a device at once, or begins."""
@@ -600,7 +605,7 @@ class Invariants:
             )
 
     def _collector_rests(self, now_s: float) -> None:
-        """A stop of any loop or of the collector, or a loop that goes to SAFE, brings the platform to rest."""
+        """A stop of any loop or of the collector, SAFE, or `off` for the last loop brings the platform to rest."""
         hexapod = self.hexapod
         if hexapod is None:
             return
@@ -615,7 +620,7 @@ class Invariants:
         if stopped_s > _COLLECTOR_RESTS_S and hexapod.moves:
             self.violated(
                 "a stop stops the collector",
-                f"it moves {stopped_s:.2f} s after a stop, or after SAFE",
+                f"it moves {stopped_s:.2f} s after a stop, SAFE, or `off` for all loops",
             )
 
     def _power(self, name: str, mode: Mode, *, busy: bool, now_s: float) -> None:

@@ -13,6 +13,13 @@ from fitctl.config.devices import C887Device
 
 Vector = Annotated[list[Finite], Field(min_length=3, max_length=3)]
 Motion = Literal["still", "drift", "sine", "random", "file"]
+_KEYS: dict[Motion, tuple[str, ...]] = {
+    "still": (),
+    "drift": ("direction_deg", "range_mm", "velocity_mm_s"),
+    "sine": ("direction_deg", "amplitude_mm", "frequency_hz"),
+    "random": ("direction_deg", "range_mm", "rms_mm_s", "correlation_s"),
+    "file": ("file",),
+}
 _NEARLY = 1e-6
 
 
@@ -111,10 +118,10 @@ class CollectorMotion(Settings):
         Raises
         ------
         ConfigError
-            If it is none; the text names each key and what is allowed.
+            If it is none, or has no use for a value; the text names each key and what is allowed.
         """
         try:
-            return CollectorMotion.model_validate(self.model_dump() | dict(values))
+            motion = CollectorMotion.model_validate(self.model_dump() | dict(values))
         except ValidationError as error:
             wrong = [
                 f"{key}: {must_be(each)} (is {each['input']!r})"
@@ -123,6 +130,11 @@ class CollectorMotion(Settings):
                 for each in error.errors()
             ]
             raise ConfigError("; ".join(wrong)) from None
+        its = _KEYS[motion.kind]
+        if unused := [key for key in values if key not in {"kind", "start_s", *its}]:
+            msg = f"{motion.kind} has no {', '.join(unused)}; it has {', '.join(its) or 'no keys'}"
+            raise ConfigError(msg)
+        return motion
 
 
 class Collector(Settings):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
+from typing import Any
 
 from fitctl.clock import Clock
 from fitctl.config import Collector, CollectorMotion, ConfigError
@@ -18,6 +19,7 @@ from fitctl.drivers.interface import (
 from fitctl.logging.records import Severity
 from fitctl.messages.commands import MoveCollector
 from fitctl.messages.telemetry import CollectorState
+from fitctl.model.collector_motion import beyond, course_of
 from fitctl.stages.collector import CollectorDrive
 from fitctl.stages.journal import error_text
 
@@ -63,7 +65,7 @@ class CollectorWatch:
         self.is_open = False
         self.error = ""
         self.endpoint = collector.hexapod.endpoint
-        self._motion = collector.motion
+        self._collector = collector
         self._hexapod = hexapod
         self._report = report
         self._busy = False
@@ -83,12 +85,20 @@ class CollectorWatch:
         if occupied := self._occupied():
             return occupied
         try:
-            motion = self._motion.changed(command.motion) if command.action == "start" else None
+            motion = self._wanted(command.motion) if command.action == "start" else None
         except ConfigError as error:
             return f"no such motion: {error}"
         self._busy = True
         self._beside(partial(self._work, motion, self._stops))
         return ""
+
+    def _wanted(self, values: Mapping[str, Any]) -> CollectorMotion:
+        """The rig's motion with these values; ConfigError if it is none that the hexapod can ever make."""
+        motion = self._collector.motion.changed(values)
+        # A file is read beside the ticks, and where the hexapod stands is compared there.
+        if motion.kind != "file" and (problems := beyond(course_of(motion, 0), self._collector)):
+            raise ConfigError("; ".join(problems))
+        return motion
 
     def _occupied(self) -> str:
         """Why nothing can begin now, or nothing."""

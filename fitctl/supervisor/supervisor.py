@@ -62,7 +62,7 @@ from fitctl.stages.servo_group import servo_groups
 from fitctl.supervisor.camera_watch import CameraWatch
 from fitctl.supervisor.collector import CollectorWatch
 from fitctl.supervisor.design_jobs import DesignJobs
-from fitctl.supervisor.device_jobs import DeviceJobs
+from fitctl.supervisor.device_jobs import DeviceJobs, Ended
 from fitctl.supervisor.frame_rate import FrameRateChange
 from fitctl.supervisor.health import (
     camera_health,
@@ -495,7 +495,7 @@ class Supervisor:
         if trigger in _POWER_UP:
             self._device_jobs.open(usable, trigger, ended)
         elif trigger is Trigger.OFF:
-            self._device_jobs.turn_off(usable, ended)
+            self._turn_off(usable, ended)
         else:
             if trigger is Trigger.STOP:
                 self._device_jobs.abandon(usable)
@@ -505,6 +505,12 @@ class Supervisor:
             if trigger is Trigger.STOP:
                 return msgspec.structs.replace(reply, text=self.modes_of(usable))
         return reply
+
+    def _turn_off(self, names: list[str], ended: Ended) -> None:
+        """Close the devices of these loops; the collector moves for no one when all loops are OFF."""
+        self._device_jobs.turn_off(names, ended)
+        if all(loop.mode is Mode.OFF for loop in self.loops.values()):
+            self._stop_collector()
 
     def _rest_mirrors(self, names: list[str]) -> list[str]:
         """Send these loops' mirrors to rest at the next ticks; return the loops with a moving mirror."""

@@ -12,7 +12,7 @@ from fitctl.clock import MonotonicClock
 from fitctl.config import ConfigError, Fault, default_rig_path, load_rig
 from fitctl.drivers.c887.driver import C887Hexapod
 from fitctl.drivers.interface import DeviceTimeout
-from fitctl.messages.commands import MoveCollector, Standby, Stop
+from fitctl.messages.commands import MoveCollector, Off, Standby, Stop
 from fitctl.messages.modes import Mode
 from fitctl.mocks.c887.server import C887ControllerMock
 from fitctl.simulation.simulation import Simulation
@@ -133,6 +133,12 @@ def test_a_motion_of_the_command_s_own_replaces_the_rig_s_once(watched):
         (MoveCollector(action="start", amplitude_mm=-1.0), "amplitude_mm: must be greater than 0"),
         (MoveCollector(action="start", direction_deg=float("nan")), "direction_deg: must be"),
         (MoveCollector(action="start", kind="file"), "file must name a CSV file"),
+        (MoveCollector(action="start", velocity_mm_s=900.0), "the motion reaches 900 mm/s"),
+        (
+            MoveCollector(action="start", range_mm=1e3),
+            "mm from end to end; collector.hexapod.travel",
+        ),
+        (MoveCollector(action="start", kind="sine", range_mm=1.0), "sine has no range_mm; it has"),
         (MoveCollector(action="stop", kind="sine"), "stop has no motion; kind belong to start"),
     ],
 )
@@ -142,15 +148,16 @@ def test_a_motion_that_is_none_is_refused_at_once(watched, command, answer):
     assert not watch.is_open
 
 
-def test_a_motion_that_goes_too_fast_is_refused_before_anything_moves(watched):
+def test_a_course_that_goes_too_far_from_where_it_stands_is_refused_before_anything_moves(watched):
     watch, mock = watched
-    watch.obey(MoveCollector(action="reference"))
-    reported(watch, "referenced")
-    until(lambda: not watch.state.busy, "the end of the reference move")
-    assert watch.obey(MoveCollector(action="start", kind="drift", velocity_mm_s=900.0)) == ""
-    reported(watch, "mm/s")
-    assert "900 mm/s" in watch.state.error
-    assert (watch.state.motion, y_mm(mock)) == ("", 0.0)
+    moving(watch, mock)
+    watch.stop()
+    until(lambda: not watch.state.busy, "the end of the stop")
+    stands_mm = y_mm(mock)
+    _, far_mm = RIG.collector.hexapod.travel.ends[1]
+    assert watch.obey(MoveCollector(action="start", kind="drift", range_mm=far_mm)) == ""
+    reported(watch, "a course with ")
+    assert (watch.state.motion, y_mm(mock)) == ("", stands_mm)
 
 
 def test_it_is_not_moved_before_it_is_referenced(watched):
@@ -292,6 +299,16 @@ def test_the_supervisor_s_stop_stops_the_collector():
     simulation.run(0.5)
     assert simulation.hexapod.pose().pose == here.pose
     assert not simulation.supervisor.collector.drive.running
+
+
+def test_off_for_the_last_loop_stops_the_collector():
+    simulation = drifting()
+    for number, name in enumerate(simulation.supervisor.loops, start=1):
+        assert simulation.command(Off(loop=name)).accepted
+        simulation.run(0.5)
+        is_last = number == len(simulation.supervisor.loops)
+        assert simulation.supervisor.collector.drive.running != is_last
+    assert not simulation.hexapod.pose().moving
 
 
 def unanswered(*_arguments, **_settings):
