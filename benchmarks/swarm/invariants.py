@@ -605,7 +605,7 @@ class Invariants:
             )
 
     def _collector_rests(self, now_s: float) -> None:
-        """A stop of any loop or of the collector, SAFE, or `off` for the last loop brings the platform to rest."""
+        """A stop, a loop that goes to SAFE, or `off` for the last loop, brings the platform to rest."""
         hexapod = self.hexapod
         if hexapod is None:
             return
