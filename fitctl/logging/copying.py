@@ -204,6 +204,13 @@ class Recovered:
     unread_bytes: int
 
 
+def recoverable(source: Path) -> Recovered:
+    """What :func:`recover` would save of a log; errors as there."""
+    reading = _Source(source)
+    records = sum(not isinstance(entry, Metadata) for entry in reading.entries())
+    return _recovered(records, reading)
+
+
 def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered:
     """Copy what is sound in a cut or damaged log into a whole one.
 
@@ -219,8 +226,12 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
         if not writing.records:
             msg = f"{source}: holds no whole record, so there is nothing to recover"
             raise LogError(msg)
+    return _recovered(writing.records, reading)
+
+
+def _recovered(records: int, reading: _Source) -> Recovered:
     return Recovered(
-        writing.records,
+        records,
         reading.damaged_chunks,
         reading.undescribed,
         reading.went_back,

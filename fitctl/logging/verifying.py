@@ -13,6 +13,7 @@ from mcap.records import Channel, DataEnd, Footer, Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC
 
+from fitctl.logging.copying import recoverable
 from fitctl.logging.errors import ForeignTopicError, LogError
 from fitctl.logging.files import DAMAGE, MEND, damaged, opened
 from fitctl.logging.folder import in_use
@@ -58,7 +59,11 @@ def verify(path: Path) -> Verdict:
     with opened(path) as (stream, finished):
         in_order, problems = _checked(stream) if finished else (Counter(), [_unfinished(path)])
     if finished and problems:  # what its messages say is not worth reading
-        return Verdict(in_order.total(), 0, 0, tuple(problems))
+        sound = recoverable(path)
+        problems.append(
+            f"{sound.damaged_chunks} damaged chunks; the other chunks have {sound.records} records"
+        )
+        return Verdict(sound.records, 0, 0, tuple(problems))
     counts: Counter[str] = Counter()
     lost = last_lost = frames_missing = newest_ns = misdated = 0
     first_misdated = ""
@@ -104,7 +109,9 @@ def verify(path: Path) -> Verdict:
 def _unfinished(path: Path) -> str:
     if in_use(path):
         return "is being recorded just now; stop the recorder, or look again when it has begun another file"
-    return f"is cut off; {MEND}"
+    return (
+        f"is cut off; {MEND}" if recoverable(path).records else "is cut off before its first record"
+    )
 
 
 def _checked(stream: IO[bytes]) -> tuple[Counter[str], list[str]]:

@@ -15,6 +15,7 @@ from fitctl.messages.modes import OPERATOR, Mode
 from fitctl.messages.telemetry import LoopState, Telemetry, TrippedInterlock
 
 FIND_STAR = "check shutter and clouds; release, stop or acquire ends the search"
+_HEXAPOD = "hexapod"  # which serves the collector and no loop
 RECORDER_SILENT_S = 10.0  # it reports about once a second
 
 _DID = {
@@ -93,9 +94,9 @@ def troubles(telemetry: Telemetry) -> list[Trouble]:
         for trouble in _of_loop(loop, telemetry.time_s):
             known = found.get(trouble.key)
             found[trouble.key] = trouble if known is None else _merged(known, trouble)
-    changed_s = max((loop.since_s for loop in telemetry.loops), default=0.0)
     for device in telemetry.devices:
-        # What a device reported before the last change of mode is of the past.
+        # What a device reported before the last change of its loops' modes is of the past.
+        changed_s = max((loop.since_s for loop in _served(telemetry, device)), default=0.0)
         is_now = device.state == "fault" and device.time_s >= changed_s
         if is_now and not any(_is_of(device, cause) for cause in found):
             trouble = _of_device(telemetry, device)
@@ -268,10 +269,18 @@ def _is_of(device: DeviceHealth, cause: str) -> bool:
     )
 
 
+def _served(telemetry: Telemetry, device: DeviceHealth) -> list[LoopState]:
+    """The loops that need a device: its own, all for the camera, none for the hexapod."""
+    own = [loop for loop in telemetry.loops if device.device.startswith(f"{loop.name} ")]
+    return own or ([] if device.device == _HEXAPOD else list(telemetry.loops))
+
+
 def _of_device(telemetry: Telemetry, device: DeviceHealth) -> Trouble:
     what, todo = _parted(device.detail)
-    loops = [loop.mode for loop in telemetry.loops if device.device.startswith(loop.name)]
-    is_safe = Mode.SAFE.name in (loops or [loop.mode for loop in telemetry.loops])
+    is_safe = Mode.SAFE.name in [loop.mode for loop in _served(telemetry, device)]
+    did = "the loop is in SAFE" if is_safe else "fitctl tries again"
+    if device.device == _HEXAPOD:
+        did = "the collector's motion has ended"
     # An error that names its device has the same cause when the loop goes to SAFE a message later.
     named = f" at {device.endpoint}: " in what
     return Trouble(
@@ -279,7 +288,7 @@ def _of_device(telemetry: Telemetry, device: DeviceHealth) -> Trouble:
         "error",
         what if named else f"{device.device} at {device.endpoint}: {what}",
         device.time_s,
-        "the loop is in SAFE" if is_safe else "fitctl tries again",
+        did,
         _then(todo, "recover") if is_safe else todo,
     )
 

@@ -48,10 +48,10 @@ def offset_mirrors(_rig: Rig, loops: Sequence[StellarLoop], command: SetBiasOffs
 def _not_in_standby(loops: Sequence[Loop]) -> str:
     for loop in loops:
         if loop.mode is not Mode.STANDBY:
-            return (
-                f"stages are moved by hand only in STANDBY (is {loop.mode.name}); while a star is held, "
-                "move the target"
-            )
+            todo = "while a star is held, move the target"
+            if not isinstance(loop, StellarLoop):
+                todo = "while its beam is held, release it first"
+            return f"stages are moved by hand only in STANDBY (is {loop.mode.name}); {todo}"
     return ""
 
 

@@ -34,10 +34,8 @@ StellarLoops = Sequence[StellarLoop]
 
 def set_target(rig: Rig, loops: StellarLoops, command: SetTarget) -> str:
     """Hold one loop's star elsewhere; empty, or why not."""
-    if (
-        len(loops) != 1
-    ):  # two stars on one place are lost, and searched for and lost again and again
-        return f"one loop has a target; name it: {', '.join(loop.name for loop in loops)}"
+    if len(loops) != 1:  # two stars on one place are lost, and searched for and lost, without end
+        return f"a target is of one loop; name the loop: {', '.join(loop.name for loop in loops)}"
     if not rig.camera.window_fits(command.az_px, command.el_px):
         return f"target {rig.camera.no_window_text(command.az_px, command.el_px)}"
     for loop in loops:
@@ -48,7 +46,7 @@ def set_target(rig: Rig, loops: StellarLoops, command: SetTarget) -> str:
 def look(rig: Rig, loops: StellarLoops, command: Look) -> str:
     """Measure one loop's star elsewhere on the next frame; empty, or why not."""
     if len(loops) != 1:
-        return f"one loop looks at a place; name it: {', '.join(loop.name for loop in loops)}"
+        return f"one loop looks at a place; name the loop: {', '.join(loop.name for loop in loops)}"
     (loop,) = loops
     if loop.mode not in WITH_WINDOW:
         return f"look is not available in {loop.mode.name}; it needs COARSE or VERNIER"
@@ -120,5 +118,7 @@ def obey_loop_command(rig: Rig, loops: Loops, command: AnyCommand) -> str:
     stellar = [loop for loop in loops if isinstance(loop, StellarLoop)]
     if not stellar:
         row = ROWS[type(command)]
-        return f"{row.name} is for a stellar loop; {command.loop} holds a metrology beam"
+        return (
+            f"{row.word or row.name} is for a stellar loop; {command.loop} holds a metrology beam"
+        )
     return OF_STARS[type(command)](rig, stellar, command)

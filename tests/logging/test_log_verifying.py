@@ -10,6 +10,7 @@ from samples.forged_logs import forged
 from samples.log_samples import (
     RUN_INFO,
     SETTINGS,
+    SMALL_CHUNKS,
     WALL_S,
     filled,
     frame,
@@ -18,9 +19,11 @@ from samples.log_samples import (
     write_log,
 )
 
+from fitctl.logging.copying import recover, recoverable
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import log_info, read_records
-from fitctl.logging.records import RecorderStatus
+from fitctl.logging.records import Event, RecorderStatus
+from fitctl.logging.seeking import SeekableLog
 from fitctl.logging.verifying import verify
 from fitctl.logging.writer import LogWriter
 
@@ -59,7 +62,27 @@ def test_any_cut_is_noticed(tmp_path_factory, data):
     content = path.read_bytes()
     path.write_bytes(content[: data.draw(st.integers(8, len(content) - 1), label="cut after")])
     (problem,) = verify(path).problems
-    assert "is cut off; `fitctl log recover`" in problem
+    assert problem.startswith("is cut off")
+    assert ("`fitctl log recover`" in problem) == (recoverable(path).records > 0)
+
+
+def test_damaged_chunks_are_counted_and_what_the_others_hold(tmp_path):
+    events = [Event(time_s=n, severity="info", source="x", message="y" * 99) for n in range(300)]
+    path = write_log(tmp_path / "a.mcap", [RUN_INFO, *events], SMALL_CHUNKS)
+    content = bytearray(path.read_bytes())
+    chunks = SeekableLog(path)._chunks
+    for place in (chunks[1], chunks[-2]):
+        content[place.offset + place.size // 2] ^= 0xFF
+    path.write_bytes(content)
+
+    verdict = verify(path)
+
+    assert 0 < verdict.records < len(events)
+    assert verdict.problems[0].startswith("is damaged: ")
+    assert verdict.problems[1:] == (
+        f"2 damaged chunks; the other chunks have {verdict.records} records",
+    )
+    assert recover(path, tmp_path / "b.mcap").records == verdict.records
 
 
 def test_a_log_that_is_being_recorded_is_not_called_cut(tmp_path):

@@ -90,9 +90,9 @@ def _listed(found: LogInfo) -> dict[str, object]:
 
 
 def _state(log: Path, found: LogInfo) -> str:
-    unfinished = (
-        "being recorded" if folder.in_use(log) else "cut off; `fitctl log recover` mends it"
-    )
+    unfinished = "cut off; `fitctl log recover` mends it" if found.counts else "cut off"
+    if folder.in_use(log):
+        unfinished = "being recorded"
     return ("finished" if found.finished else unfinished) + (
         "; kept" if folder.is_kept(log) else ""
     )

@@ -227,7 +227,8 @@ def _table(
     return "\n".join(
         [
             f"loop {name}: {summary.held} of {summary.runs} runs held their {held}, "
-            f"{summary.judged} for long enough to be judged",
+            f"{summary.judged} for long enough to be judged"
+            + ("" if summary.judged or not summary.held else "; use a longer --duration"),
             f"  {'':18}{'mean':>10}{head}{'worst':>10}",
             *(_row(title, figure, digits, scale) for title, figure, digits, scale in rows),
             f"  worst seeds       {worst}",
@@ -237,4 +238,6 @@ def _table(
 
 def _row(title: str, figure: Statistics, digits: int, scale: float) -> str:
     values = [figure.mean, *figure.percentiles.values(), figure.worst]
-    return f"  {title:18}" + "".join(f"{value * scale:10.{digits}f}" for value in values)
+    return f"  {title:18}" + "".join(
+        f"{'-':>10}" if math.isnan(value) else f"{value * scale:10.{digits}f}" for value in values
+    )

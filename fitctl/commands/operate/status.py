@@ -93,6 +93,7 @@ def _rows(telemetry: Telemetry) -> Iterator[tuple[str, str]]:
     for loop in telemetry.loops:
         text = f"{loop.mode} for {duration(telemetry.time_s - loop.since_s)}"
         text += f", controller {loop.controller}" if loop.controller else ""
+        text += f", waits for {loop.waits_for}" if loop.waits_for else ""
         yield loop.name, text + _beam(telemetry, loop.name)
     if telemetry.overlaps and not math.isnan(telemetry.overlaps[-1].visibility):
         overlap = telemetry.overlaps[-1]

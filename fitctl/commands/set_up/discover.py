@@ -12,6 +12,7 @@ import can
 import typer
 from serial.tools import list_ports
 
+from fitctl.commands.shared.exits import FAILED
 from fitctl.commands.shared.options import JsonOption
 from fitctl.commands.shared.printing import say, to_json
 from fitctl.config import ConfigError
@@ -35,7 +36,8 @@ def discover(
 ) -> None:
     """List cameras, LabJacks, serial ports and CAN interfaces.
 
-    Sends a broadcast to which cameras and LabJacks answer. A C-887 has no documented way of discovery.
+    Sends a broadcast to which cameras and LabJacks answer. A C-887 has no documented way of discovery. Exit
+    status 1 if the broadcast could not be sent; --json then has null in place of what might be there.
     """
     try:
         IPv4Address(broadcast)
@@ -45,7 +47,7 @@ def discover(
     with ThreadPoolExecutor() as pool:
         cameras = pool.submit(_cameras, broadcast, wait_s)
         labjacks = pool.submit(_labjacks, broadcast, wait_s)
-    found = {
+    found: dict[str, list[dict[str, str]] | None] = {
         "cameras": cameras.result(),
         "labjacks": labjacks.result(),
         "serial_ports": _serial_ports(),
@@ -53,31 +55,32 @@ def discover(
     }
     if as_json:
         say(to_json(found))
-        return
-    for title, entries in found.items():
-        say(title.replace("_", " ") + ("" if entries else ": none"))
-        for entry in entries:
+    for title, entries in () if as_json else found.items():
+        there = "" if entries else ": not known" if entries is None else ": none"
+        say(title.replace("_", " ") + there)
+        for entry in entries or ():
             say("  " + "  ".join(str(value) for value in entry.values() if value))
+    raise typer.Exit(FAILED if None in found.values() else 0)
 
 
-def _cameras(broadcast: str, wait_s: float) -> list[dict[str, str]]:
+def _cameras(broadcast: str, wait_s: float) -> list[dict[str, str]] | None:
     try:
         cameras = discover_cameras(broadcast, wait_s)
     except DeviceUnreachable as error:
         say(f"cameras: {error}", err=True)
-        return []
+        return None
     return [
         {"address": one.address, "mac": one.mac, "name": one.user_name, **asdict(one.identity)}
         for one in cameras
     ]
 
 
-def _labjacks(broadcast: str, wait_s: float) -> list[dict[str, str]]:
+def _labjacks(broadcast: str, wait_s: float) -> list[dict[str, str]] | None:
     try:
         labjacks = discover_labjacks(broadcast, wait_s)
     except DeviceUnreachable as error:
         say(f"labjacks: {error}", err=True)
-        return []
+        return None
     return [{"address": one.address, **asdict(one.identity)} for one in labjacks]
 
 

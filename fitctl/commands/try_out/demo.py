@@ -183,11 +183,20 @@ def _summary_text(name: str, result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def _seconds(time_s: float) -> str:
+    return "   never" if math.isnan(time_s) else f"{time_s:8.1f} s"
+
+
 def _star_lines(result: dict[str, Any]) -> list[str]:
+    lines = [
+        f"  star found after     {_seconds(result['acquired_s'])}",
+        f"  vernier after        {_seconds(result['vernier_s'])}",
+    ]
+    if not result["judged_s"]:
+        return [*lines, "  RMS                  not measured: the star is not held at the end"]
     rms, measured, arcsec = result["rms_px"], result["measured_rms_px"], result["rms_arcsec"]
     return [
-        f"  star found after     {result['acquired_s']:8.1f} s",
-        f"  vernier after        {result['vernier_s']:8.1f} s",
+        *lines,
         f"  true residual RMS    az {rms['az']:.4f} px, el {rms['el']:.4f} px"
         f" (az {arcsec['az']:.3f}, el {arcsec['el']:.3f} arcsec on the sky)"
         f" over the last {result['judged_s']:.0f} s",
@@ -196,10 +205,15 @@ def _star_lines(result: dict[str, Any]) -> list[str]:
 
 
 def _beam_lines(result: dict[str, Any]) -> list[str]:
+    lines = [
+        f"  beam found after     {_seconds(result['acquired_s'])}",
+        f"  locked after         {_seconds(result['locked_s'])}",
+    ]
+    if not result["judged_s"]:
+        return [*lines, "  RMS                  not measured: the beam is not held at the end"]
     arcsec = result["rms_arcsec"]
     return [
-        f"  beam found after     {result['acquired_s']:8.1f} s",
-        f"  locked after         {result['locked_s']:8.1f} s",
+        *lines,
         f"  true beam RMS        az {arcsec['az']:.3f} arcsec, el {arcsec['el']:.3f} arcsec"
         f" over the last {result['judged_s']:.0f} s",
     ]

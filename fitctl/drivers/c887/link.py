@@ -213,18 +213,21 @@ class C887Link:
 
     def _nonsense(self, expected: str, got: str) -> NoReturn:
         self.close()
-        hint = "check collector.hexapod.baud_rate, and that no other program uses this port; then recover"
+        hint = (
+            "check collector.hexapod.baud_rate, and that no other program uses this port; then start the "
+            "collector"
+        )
         raise self.endpoint.error(DeviceProtocolError, expected, got, hint)
 
     def _silent(self, expected: str, got: str) -> DeviceTimeout:
-        hint = "check the controller's power and cable, and collector.hexapod.port; then recover"
+        hint = "check the controller's power and cable, and collector.hexapod.port; then start the collector"
         return self.endpoint.error(
             DeviceTimeout, f"{expected} within {self._limit_s:g} s", got, hint
         )
 
     def _broken(self, name: str, error: OSError) -> DeviceUnreachable:
         self.close()
-        hint = "check its power and cable, then recover; after a loss of power, reference it"
+        hint = "check its power and cable, then start the collector; after a loss of power, reference it"
         return self.endpoint.error(
             DeviceUnreachable, f"to send {name}", f"a broken connection ({error})", hint
         )

@@ -60,9 +60,13 @@ class AlarmBar(Panel):
         lines = []
         for alarm in shown:
             lines += self._alarm(alarm, columns)
-        keys = self._keys(len(alarms) - len(shown))
-        if width(lines[-1]) + width(keys) <= columns:
-            lines[-1] = [*pad(lines[-1], columns - width(keys)), *keys]
+        more = len(alarms) - len(shown)
+        keys = self._keys(more)
+        if width(lines[-1]) + width(keys) > columns:
+            if not more:  # the keys are below, too
+                return lines
+            lines.append([])
+        lines[-1] = [*pad(lines[-1], columns - width(keys)), *keys]
         return lines
 
     def _keys(self, more: int) -> Line:

@@ -97,6 +97,21 @@ def test_a_tripped_interlock_and_a_device_in_fault_are_named_with_what_to_do():
     ]
 
 
+@pytest.mark.parametrize("mode", ["STANDBY", "SAFE"])
+def test_the_hexapod_s_fault_is_the_collector_s_and_of_no_loop(mode):
+    message = told(FakeSupervisor(mode, loops=("right", "metrology", "left")))
+    hexapod = next(one for one in message.devices if one.device == "hexapod")
+    fault = msgspec.structs.replace(
+        hexapod, state="fault", time_s=0.0, detail="no answer; then start the collector"
+    )
+    found = lines(msgspec.structs.replace(message, devices=[fault]))
+
+    assert found[-1] == (
+        f"hexapod at {hexapod.endpoint}: no answer; the collector's motion has ended; "
+        "then start the collector"
+    )
+
+
 def test_a_lost_star_is_one_trouble_as_long_as_it_is_searched_for():
     supervisor = FakeSupervisor("ACQUISITION")
     supervisor.search_again = STAR_LOST
@@ -165,6 +180,17 @@ def test_people_read_the_verdict_first_then_loops_devices_and_log():
     for device in message.devices:
         assert device.endpoint in text
     assert message.recorder.path in text
+
+
+def test_people_read_what_a_loop_waits_for():
+    message = told(FakeSupervisor(loops=("right", "metrology", "left")))
+    loops = [
+        msgspec.structs.replace(loop, waits_for="metrology" if loop.name == "left" else "")
+        for loop in message.loops
+    ]
+    rows = status_lines(msgspec.structs.replace(message, loops=loops), [])
+
+    assert [row.split()[0] for row in rows if row.endswith(", waits for metrology")] == ["left"]
 
 
 def test_people_read_of_the_queues_that_left_something_unsent():

@@ -197,7 +197,7 @@ def test_a_target_is_of_one_loop_so_that_two_stars_are_not_sent_to_one_place():
 
     refused = simulation.command(SetTarget(az_px=20.0, el_px=20.0))
     assert not refused.accepted
-    assert refused.text == "one loop has a target; name it: right, left"
+    assert refused.text == "a target is of one loop; name the loop: right, left"
     assert targets_px == {name: simulation.loop(name).target_px.tolist() for name in TARGET_PX}
 
     assert simulation.command(SetTarget(loop=LEFT, az_px=12.0, el_px=22.0)).accepted

@@ -92,7 +92,8 @@ def test_a_hexapod_that_is_not_referenced_fails_the_step(testbed):
 
 def test_a_motion_that_ends_leaves_the_next_one_free_to_begin(testbed):
     stop = {"step": "collector", "action": "stop"}
-    testbed(REFERENCE, SINE, WAIT, stop, {**SINE, "kind": "drift"}, WAIT, stop)
+    drift = {"step": "collector", "action": "start", "kind": "drift"}
+    testbed(REFERENCE, SINE, WAIT, stop, drift, WAIT, stop)
     assert testbed.outcomes() == ["done"] * 7
 
 
