@@ -226,6 +226,13 @@ def _valid(laid: LaidOver, origin: str) -> Rig:
             f"file. To write it for this one: fitctl rig upgrade {place}"
         )
         raise ConfigError(plain(msg))
+    if isinstance(version, int) and version > SCHEMA_VERSION:
+        place = _place(laid, origin, ["schema_version"])
+        msg = (
+            f"{place}: schema_version: must be {SCHEMA_VERSION} (is {version}); a newer fitctl wrote this "
+            "file: use that one"
+        )
+        raise ConfigError(plain(msg))
     try:
         return Rig.model_validate(laid.document)
     except ValidationError as error:

@@ -9,6 +9,7 @@ from fitctl.messages.troubles import Trouble, troubles
 from fitctl.tui.state import ConsoleState
 
 BELL_EVERY_S = 10.0
+_NO_DATA = "no data"
 STOPPED = "stopped by the operator"  # as `troubles` has it, who does not know who it was
 
 
@@ -84,8 +85,11 @@ class AlarmBook:
 
     @property
     def in_order(self) -> list[Alarm]:
-        """The weightiest first: not acknowledged, errors, the newest."""
-        return sorted(self.alarms.values(), key=lambda a: (a.acknowledged, not a.error, -a.since_s))
+        """The weightiest first: not acknowledged, that nothing comes any more, errors, the newest."""
+        return sorted(
+            self.alarms.values(),
+            key=lambda a: (a.acknowledged, a.key != _NO_DATA, not a.error, -a.since_s),
+        )
 
     def acknowledge(self, shown: Mapping[str, int]) -> None:
         """Acknowledge the alarms that the operator was shown; of these, what is over goes.
@@ -171,7 +175,7 @@ def _alarm(trouble: Trouble) -> Alarm:
 def _no_data(state: ConsoleState) -> Alarm:
     if state.newest is not None and state.newest.shutting_down:
         return Alarm(
-            "no data",
+            _NO_DATA,
             False,
             f"the supervisor shut down; it was last heard {state.silent_s:.0f} s ago",
             state.received_s,
@@ -180,7 +184,7 @@ def _no_data(state: ConsoleState) -> Alarm:
             latches=False,
         )
     return Alarm(
-        "no data",
+        _NO_DATA,
         True,
         f"NO DATA for {state.silent_s:.0f} s" + ("; what you see is old" if state.newest else ""),
         state.received_s,

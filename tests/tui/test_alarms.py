@@ -200,15 +200,19 @@ def test_silence_of_the_supervisor_is_an_alarm_that_ends_with_it():
 
 
 def test_a_supervisor_that_shut_down_is_no_danger():
-    watch = Watch(FakeSupervisor("SAFE"))
+    watch = Watch(FakeSupervisor())
+    watch.supervisor.interlocks = [tripped(action="freeze")]
+    watch.hear()
+    watch.supervisor = FakeSupervisor("SAFE")
     (message,) = watch.supervisor.messages(1)
     last = msgspec.structs.replace(message, shutting_down=True)
     watch.state.accept(last, last.time_s)
     watch.state.now_s = last.time_s + 7.0
     watch.book.update(watch.state)
 
-    (alarm,) = watch.book.in_order
+    alarm, over = watch.book.in_order
 
+    assert over.over_s is not None
     assert alarm.what == "the supervisor shut down; it was last heard 7 s ago"
     assert not alarm.error
 

@@ -15,7 +15,7 @@ from fitctl.commands.shared.logs import LatestOption, chosen_logs
 from fitctl.commands.shared.opened import opened_loop
 from fitctl.commands.shared.options import ControllerOption, JsonOption, SetOption
 from fitctl.commands.shared.printing import progress_line, say, to_json
-from fitctl.commands.shared.rig import controller_overrides
+from fitctl.commands.shared.rig import blaming_controller, controller_overrides
 from fitctl.config import ConfigError, Rig, load_rig, rig_from_log
 from fitctl.controllers.design.basis import basis
 from fitctl.controllers.design.choose import design_for
@@ -204,7 +204,8 @@ def _rig(
 
     rig = read(overrides)
     if controller is not None:
-        rig = read([*overrides, *controller_overrides(rig.stellar_loops, controller)])
+        with blaming_controller():
+            rig = read([*overrides, *controller_overrides(rig.stellar_loops, controller)])
     try:
         unlike = unlike_the_log(rig, in_log)
     except NO_RIG as error:

@@ -21,7 +21,7 @@ from fitctl.commands.shared.options import (
     OverwriteOption,
     SetOption,
 )
-from fitctl.commands.shared.printing import say_lines, to_json
+from fitctl.commands.shared.printing import say, say_lines, to_json
 from fitctl.commands.shared.rig import require_loop, rig_of
 from fitctl.config import ConfigError, Rig
 from fitctl.controllers.design import coarse, lqg_ltr
@@ -136,6 +136,8 @@ def design(
         title = "Coarse and vernier loop shapes (Fig. 9), LQG/LTR"
         save_figure(draw_loop_shapes(its_basis, vernier, title), plot)
     say_lines(to_json(result) if as_json else "\n".join(lines))
+    if out is not None and not as_json:
+        say(f"written: {out} (name it in loops.{loop}.vernier.controller)")
 
 
 # ---------------------------------------------------------------- the paper's vernier and coarse

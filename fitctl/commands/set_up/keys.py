@@ -61,6 +61,8 @@ def list_(
         say(to_json([{"name": k.name, "role": k.role, "public": k.public} for k in keys.values()]))
     for key in () if as_json else keys.values():
         say(f"{key.name:<32}  {key.role:<9}  {key.public[:8]}...")
+    if not (keys or problems or as_json):
+        say("no keys: nobody is allowed from elsewhere")
     for problem in problems:
         say(problem, err=True)
     raise typer.Exit(1 if problems else 0)

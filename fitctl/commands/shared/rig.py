@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from fitctl.config import ConfigError, Rig, default_rig_path, load_rig
@@ -33,11 +34,18 @@ def with_controller(
         return overrides or []
     loops = rig_of(path, overrides).stellar_loops
     changed = [*(overrides or []), *controller_overrides(loops, controller)]
-    try:
+    with blaming_controller():
         rig_of(path, changed)
-    except ConfigError as error:  # the rig was well without it
-        raise ConfigError(str(error).replace("--set: ", "--controller: ", 1)) from None
     return changed
+
+
+@contextmanager
+def blaming_controller() -> Iterator[None]:
+    """Read a rig inside that was well without its :func:`controller_overrides`: errors name the option."""
+    try:
+        yield
+    except ConfigError as error:
+        raise ConfigError(str(error).replace("--set: ", "--controller: ", 1)) from None
 
 
 def controller_overrides(loops: Iterable[str], controller: str) -> list[str]:

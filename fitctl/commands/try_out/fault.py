@@ -45,12 +45,14 @@ def set_(
         float | None,
         typer.Option(
             "--for",
+            min=0.001,
             metavar="SECONDS",
             help="End the fault after this time. [default: when cleared]",
         ),
     ] = None,
     probability: Annotated[
-        float, typer.Option(help="Probability that the fault hits a message or frame.")
+        float,
+        typer.Option(min=0.0, max=1.0, help="Probability that the fault hits a message or frame."),
     ] = 1.0,
     rig: RigOption = None,
     overrides: SetOption = None,

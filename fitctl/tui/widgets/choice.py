@@ -9,12 +9,14 @@ from textual.binding import Binding, BindingType
 from textual.events import Click, MouseScrollDown, MouseScrollUp
 from textual.message import Message
 
-from fitctl.tui.inks import SKY
+from fitctl.tui.inks import DIM, SKY
 from fitctl.tui.look import Line, text
 from fitctl.tui.state import ConsoleState
 from fitctl.tui.widgets.panel import Panel
 
 BAR = "▌"
+THIN_BAR = "▏"
+"""Before the chosen row of a list that does not have the focus."""
 
 
 class Choice(Panel, can_focus=True):
@@ -81,8 +83,9 @@ class Choice(Panel, can_focus=True):
         self.chosen = max(0, min(self.chosen, len(lines) - 1))
         lowest = max(0, len(lines) - room)
         self._top = min(max(self._top, self.chosen - room + 1, 0), self.chosen, lowest)
+        mark = text(BAR, SKY, bold=True) if self.has_focus else text(THIN_BAR, DIM)
         shown = [
-            [text(BAR if number == self.chosen and self.has_focus else " ", SKY, bold=True), *line]
+            [mark if number == self.chosen else text(" "), *line]
             for number, line in enumerate(lines[self._top : self._top + room], start=self._top)
         ]
         return [*([text(" "), *line] for line in heads), *shown]

@@ -155,6 +155,8 @@ class Header(Panel):
             return [text(" ◌ connecting ", PAPER, on=SKY, bold=True)]
         if not state.live:
             return [text(" ◀◀ PAST ", PAPER, on=WHITE, bold=True)]
+        if state.stale and state.newest.shutting_down:
+            return [text(" supervisor shut down ", PAPER, on=ORANGE, bold=True)]
         if state.stale:
             return [text(" ✗ link lost ", PAPER, on=RED, bold=True)]
         line = [text("●", GREEN), text(f" live {state.rate_hz:.0f} Hz", DIM)]

@@ -94,8 +94,6 @@ def test_a_fault_ends_after_its_time(fault):
     [
         (["right.mdt693", "melt"], "right.mdt693 has no fault melt; it has drop"),
         (["left.mdt693", "drop"], "no device is named left.mdt693; there are camera, right.drive"),
-        (["camera", "drop", "--probability", "2"], "probability"),
-        (["camera", "drop", "--for", "-1"], "for_s"),
         (["camera", "drop", "5"], "takes no value"),
         (["camera", "delay", "nan"], "value"),
     ],
@@ -106,6 +104,16 @@ def test_what_cannot_be_is_one_line_and_status_2(fault, arguments, said):
     which, why = err.splitlines()
     assert which.startswith("rig fit-mock: ")
     assert said in why
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("--probability", "2"), ("--for", "-1"), ("--for", "0")]
+)
+def test_an_option_out_of_its_range_is_named(fault, option, value):
+    status, out, err = fault("set", "camera", "drop", option, value)
+    assert (status, out) == (2, "")
+    assert option in err
+    assert err.count("\n") <= 1
 
 
 def test_without_mocks_it_says_so(capsys):
