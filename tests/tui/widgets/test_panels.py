@@ -343,8 +343,8 @@ def test_a_reading_out_of_its_range_changes_its_sign():
     ]
     after = plain(Readings(shown(supervisor)).draw(100, 20))
     was, becomes = (next(line for line in lines if "dac_slow" in line) for lines in (before, after))
-    assert was.lstrip("▌ ").startswith("✓ dac_slow")
-    assert becomes.lstrip("▌ ").startswith("▲ dac_slow")
+    assert was.lstrip("▌▏ ").startswith("✓ dac_slow")
+    assert becomes.lstrip("▌▏ ").startswith("▲ dac_slow")
 
 
 @pytest.mark.parametrize(
