@@ -58,7 +58,7 @@ def read_answers(data: bytes) -> None:
             ours.setblocking(False)
             link = T7Link.__new__(T7Link)
             link._endpoint, link._socket, link._pending = Endpoint("T7", ""), ours, bytearray()
-            link._unit, link._timeout_s, link._transaction = 1, 0.001, 0
+            link._unit, link._timeout_s, link._transaction, link._owed = 1, 0.001, 0, 0
             link._station, link._keys, link.arrived_s = "the T7", "sensor.device", 0.0
             driver = LabJackT7(_DEVICE)
             driver._link = link
