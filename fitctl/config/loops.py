@@ -292,7 +292,13 @@ class Logging(Settings):
 
     @property
     def folder_path(self) -> Path:
-        """The folder, in which ``~`` is somebody's home; ConfigError if nobody knows that user."""
+        """The folder, with ``~`` expanded to the user's home directory.
+
+        Raises
+        ------
+        ConfigError
+            If there is no such user.
+        """
         try:
             return Path(self.folder).expanduser()
         except RuntimeError as error:

@@ -218,20 +218,16 @@ def rig_from_parts(laid: LaidOver, origin: str) -> Rig:
 
 def _valid(laid: LaidOver, origin: str) -> Rig:
     version = laid.document.get("schema_version")
-    if isinstance(version, int) and version < SCHEMA_VERSION:
-        # One line: most keys of the newer version are missing, too.
+    if isinstance(version, int) and version != SCHEMA_VERSION:
+        # One line: many keys of the other version are missing, too.
         place = _place(laid, origin, ["schema_version"])
-        msg = (
-            f"{place}: schema_version: must be {SCHEMA_VERSION} (is {version}); an older fitctl wrote this "
-            f"file. To write it for this one: fitctl rig upgrade {place}"
-        )
-        raise ConfigError(plain(msg))
-    if isinstance(version, int) and version > SCHEMA_VERSION:
-        place = _place(laid, origin, ["schema_version"])
-        msg = (
-            f"{place}: schema_version: must be {SCHEMA_VERSION} (is {version}); a newer fitctl wrote this "
-            "file: use that one"
-        )
+        why = "a newer fitctl wrote this file: use that one"
+        if version < SCHEMA_VERSION:
+            why = (
+                "an older fitctl wrote this file. To write it for this one: "
+                f"fitctl rig upgrade {place}"
+            )
+        msg = f"{place}: schema_version: must be {SCHEMA_VERSION} (is {version}); {why}"
         raise ConfigError(plain(msg))
     try:
         return Rig.model_validate(laid.document)

@@ -23,7 +23,9 @@ from fitctl.drivers.modbus import (
     pop_answer,
 )
 
-_MOST_UNASKED = 100  # answers: whoever waits for the last of those that come must get there
+_MOST_UNASKED = (
+    100  # answers beyond the requests; more of them would keep a caller reading without end
+)
 _SO_TIMESTAMPNS = 35  # of Linux; not in Python's socket module
 _TIMESPEC = struct.Struct("@ll")
 _STAMP_BYTES = socket.CMSG_SPACE(_TIMESPEC.size)
@@ -75,7 +77,7 @@ class ModbusLink:
         self._keys = keys
         self._pending = bytearray()
         self._transaction = 0
-        self._owed = 0  # requests without an answer; negative after answers that nobody asked for
+        self._owed = 0  # requests sent less answers received
         try:
             self._socket = socket.create_connection((host, port), timeout_s)
         except (OSError, UnicodeError) as error:  # UnicodeError: a host that is no name at all

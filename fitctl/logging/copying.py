@@ -204,6 +204,11 @@ class Recovered:
     unread_bytes: int
 
 
+def is_recoverable(source: Path) -> bool:
+    """Whether :func:`recover` would save any record of a log; reads no farther than the first."""
+    return any(not isinstance(entry, Metadata) for entry in _Source(source).entries())
+
+
 def recoverable(source: Path) -> Recovered:
     """What :func:`recover` would save of a log; errors as there."""
     reading = _Source(source)

@@ -17,6 +17,7 @@ FailingDevice = Literal[
     "camera", "siderostat", "D/A", "D/A between frames", "injector", "piezo", "photodiodes"
 ]
 CAMERA: Final = "camera"
+HEXAPOD: Final = "hexapod"
 MOST = 1e15
 """Beyond all times and numbers that an instrument logs: what is not less was not recorded by fitctl."""
 

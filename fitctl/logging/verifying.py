@@ -13,7 +13,7 @@ from mcap.records import Channel, DataEnd, Footer, Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import MCAP0_MAGIC
 
-from fitctl.logging.copying import recoverable
+from fitctl.logging.copying import is_recoverable, recoverable
 from fitctl.logging.errors import ForeignTopicError, LogError
 from fitctl.logging.files import DAMAGE, MEND, damaged, opened
 from fitctl.logging.folder import in_use
@@ -109,9 +109,7 @@ def verify(path: Path) -> Verdict:
 def _unfinished(path: Path) -> str:
     if in_use(path):
         return "is being recorded just now; stop the recorder, or look again when it has begun another file"
-    return (
-        f"is cut off; {MEND}" if recoverable(path).records else "is cut off before its first record"
-    )
+    return f"is cut off; {MEND}" if is_recoverable(path) else "is cut off before its first record"
 
 
 def _checked(stream: IO[bytes]) -> tuple[Counter[str], list[str]]:

@@ -10,12 +10,11 @@ import math
 from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
-from fitctl.logging.records import DeviceHealth
+from fitctl.logging.records import HEXAPOD, DeviceHealth
 from fitctl.messages.modes import OPERATOR, Mode
 from fitctl.messages.telemetry import LoopState, Telemetry, TrippedInterlock
 
 FIND_STAR = "check shutter and clouds; release, stop or acquire ends the search"
-_HEXAPOD = "hexapod"  # which serves the collector and no loop
 RECORDER_SILENT_S = 10.0  # it reports about once a second
 
 _DID = {
@@ -272,15 +271,14 @@ def _is_of(device: DeviceHealth, cause: str) -> bool:
 def _served(telemetry: Telemetry, device: DeviceHealth) -> list[LoopState]:
     """The loops that need a device: its own, all for the camera, none for the hexapod."""
     own = [loop for loop in telemetry.loops if device.device.startswith(f"{loop.name} ")]
-    return own or ([] if device.device == _HEXAPOD else list(telemetry.loops))
+    return own or ([] if device.device == HEXAPOD else list(telemetry.loops))
 
 
 def _of_device(telemetry: Telemetry, device: DeviceHealth) -> Trouble:
     what, todo = _parted(device.detail)
-    is_safe = Mode.SAFE.name in [loop.mode for loop in _served(telemetry, device)]
-    did = "the loop is in SAFE" if is_safe else "fitctl tries again"
-    if device.device == _HEXAPOD:
-        did = "the collector's motion has ended"
+    served = _served(telemetry, device)
+    is_safe = any(loop.mode == Mode.SAFE.name for loop in served)
+    did = "fitctl tries again" if served else "the collector's motion has ended"
     # An error that names its device has the same cause when the loop goes to SAFE a message later.
     named = f" at {device.endpoint}: " in what
     return Trouble(
@@ -288,7 +286,7 @@ def _of_device(telemetry: Telemetry, device: DeviceHealth) -> Trouble:
         "error",
         what if named else f"{device.device} at {device.endpoint}: {what}",
         device.time_s,
-        did,
+        "the loop is in SAFE" if is_safe else did,
         _then(todo, "recover") if is_safe else todo,
     )
 

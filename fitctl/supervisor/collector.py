@@ -16,14 +16,13 @@ from fitctl.drivers.interface import (
     DeviceRefused,
     Hexapod,
 )
-from fitctl.logging.records import Severity
+from fitctl.logging.records import HEXAPOD, Severity
 from fitctl.messages.commands import MoveCollector
 from fitctl.messages.telemetry import CollectorState
 from fitctl.model.collector_motion import beyond, course_of
 from fitctl.stages.collector import CollectorDrive
 from fitctl.stages.journal import error_text
 
-HEXAPOD = "hexapod"
 _STOPPED_FIRST = "nothing began to move: a stop came first; start it again when it may move"
 _CLOSE_TIMEOUT_S = 5.0
 _STILL_CONNECTED = (DeviceRefused, DeviceFault, ConfigError)  # the others end the connection

@@ -6,11 +6,11 @@ from collections.abc import Mapping
 
 from fitctl.config import Rig
 from fitctl.drivers.interface import CameraCounts, DeviceIdentity
-from fitctl.logging.records import CAMERA, DeviceHealth
+from fitctl.logging.records import CAMERA, HEXAPOD, DeviceHealth
 from fitctl.loop.loop import Loop
 from fitctl.loop.metrology import MetrologyLoop
 from fitctl.loop.stellar import StellarLoop
-from fitctl.supervisor.collector import HEXAPOD, CollectorWatch
+from fitctl.supervisor.collector import CollectorWatch
 from fitctl.supervisor.piezo import PiezoWatch
 
 Identities = Mapping[str, DeviceIdentity]

@@ -507,7 +507,7 @@ class Supervisor:
         return reply
 
     def _turn_off(self, names: list[str], ended: Ended) -> None:
-        """Close the devices of these loops; the collector moves for no one when all loops are OFF."""
+        """Close the devices of these loops, and stop the collector if that was the last of the loops."""
         self._device_jobs.turn_off(names, ended)
         if all(loop.mode is Mode.OFF for loop in self.loops.values()):
             self._stop_collector()

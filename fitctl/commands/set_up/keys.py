@@ -62,7 +62,7 @@ def list_(
     for key in () if as_json else keys.values():
         say(f"{key.name:<32}  {key.role:<9}  {key.public[:8]}...")
     if not (keys or problems or as_json):
-        say("no keys: nobody is allowed from elsewhere")
+        say("no keys: nobody can connect from another machine")
     for problem in problems:
         say(problem, err=True)
     raise typer.Exit(1 if problems else 0)

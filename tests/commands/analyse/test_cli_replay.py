@@ -75,6 +75,13 @@ def test_another_controller_differs_and_the_table_says_where_and_that_it_is_open
     assert "open loop: today's commands do not change the frames, which are the log's" in text
 
 
+def test_a_controller_that_is_none_is_blamed_on_its_option(replay, log):
+    status, _, error = replay(log, "--controller", "nosuch")
+
+    assert status == 2
+    assert error.startswith("--controller: loops.right.vernier.controller: must be one of")
+
+
 def test_a_log_too_short_for_an_expected_rms_says_so(replay, log):
     _, text, _ = replay(log, "--controller", "lqg-ltr")
 

@@ -116,6 +116,13 @@ def test_a_plot_without_from_begins_with_what_waited_for_the_recorder(fitctl, lo
     assert fitctl("plot", late, "error_az_px", "--from", "0", "--to", "-1.0")[0] == 2
 
 
+def test_a_plot_whose_end_is_before_its_beginning_says_so(fitctl, logs):
+    status, _, problem = fitctl("plot", "logs/b.mcap", "record*", "--from", "20", "--to", "10")
+
+    assert status == 2
+    assert problem.startswith("plot: --to 10 is not after --from 20; choose a later --to")
+
+
 def test_latest_goes_before_the_topics_of_a_plot(fitctl, logs):
     by_name = fitctl("plot", "logs/b.mcap", "record*")
 

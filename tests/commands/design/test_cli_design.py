@@ -142,6 +142,7 @@ def test_a_design_is_saved_and_can_be_chosen_by_its_file(design, tmp_path, capsy
     path = tmp_path / "mine.json"
     status, out, _ = design("minimum-variance", "--out", path)
     assert status == 0
+    assert f"written: {path} (name it in loops.right.vernier.controller)" in out
     assert "of the bound" in out
     with pytest.raises(SystemExit):
         main(

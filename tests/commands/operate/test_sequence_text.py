@@ -6,7 +6,7 @@ from fitctl.commands.operate.sequence_text import attempts_text
 from fitctl.logging.records import SequenceAttempt
 
 
-def attempt(loop, **fields):
+def attempt(loop):
     return SequenceAttempt(
         time_s=1.0,
         sequence_name="acquire",
@@ -19,7 +19,6 @@ def attempt(loop, **fields):
         outcome="done",
         message="held",
         figures_json="{}",
-        **fields,
     )
 
 
@@ -34,8 +33,9 @@ def test_attempts_of_several_loops_name_their_loops():
 
 
 def test_names_and_reasons_stay_whole_where_a_star_has_no_figures():
-    skipped = attempt("right", star="Menkalinan")
-    skipped = msgspec.structs.replace(skipped, outcome="failed", message="a resonance")
+    skipped = msgspec.structs.replace(
+        attempt("right"), star="Menkalinan", outcome="failed", message="a resonance"
+    )
     last = attempts_text([skipped]).splitlines()[-1]
 
     assert last.split() == ["Menkalinan", "-", "-", "-", "-", "a", "resonance"]

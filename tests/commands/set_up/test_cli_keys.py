@@ -66,6 +66,11 @@ def test_a_mistake_is_one_line_and_status_2(settings, capsys, arguments, complai
     assert len(told.splitlines()) == 1
 
 
+def test_a_list_of_no_keys_says_so(settings, capsys):
+    assert fitctl("keys", "list", *settings) == 0
+    assert capsys.readouterr().out.startswith("no keys: ")
+
+
 def test_a_key_made_for_a_rig_that_does_not_listen_says_so(settings, capsys):
     off = ["--set", "service.tcp_address=", "--host", "rig"]
 
