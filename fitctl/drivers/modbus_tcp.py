@@ -23,9 +23,8 @@ from fitctl.drivers.modbus import (
     pop_answer,
 )
 
-_MOST_UNASKED = (
-    100  # answers beyond the requests; more of them would keep a caller reading without end
-)
+# So many answers more than requests, since the last one; with still more, a caller would read without end.
+_MOST_UNASKED = 100
 _SO_TIMESTAMPNS = 35  # of Linux; not in Python's socket module
 _TIMESPEC = struct.Struct("@ll")
 _STAMP_BYTES = socket.CMSG_SPACE(_TIMESPEC.size)
@@ -77,7 +76,7 @@ class ModbusLink:
         self._keys = keys
         self._pending = bytearray()
         self._transaction = 0
-        self._owed = 0  # requests sent less answers received
+        self._owed = 0  # answers to requests sent that have not come; negative where too many have
         try:
             self._socket = socket.create_connection((host, port), timeout_s)
         except (OSError, UnicodeError) as error:  # UnicodeError: a host that is no name at all
@@ -105,7 +104,7 @@ class ModbusLink:
             self._socket.sendall(TCP.buildFrame(request))
         except OSError as error:
             raise self._broken(str(error)) from error
-        self._owed += 1
+        self._owed = max(self._owed, 0) + 1  # what came twice before counts no more
         return self._transaction
 
     def receive(self, deadline_s: float) -> Answer | None:

@@ -30,6 +30,7 @@ from fitctl.loop.metrology import MetrologyLoop
 from fitctl.loop.observation import Observation
 from fitctl.loop.pointing import Pointing, error_from
 from fitctl.loop.quantities import StellarQuantities, stellar_places
+from fitctl.loop.search.attribution import OtherStages
 from fitctl.loop.search.finder import StarFinder
 from fitctl.loop.search.star import StarSearch
 from fitctl.loop.star_motion import StarMotion
@@ -298,10 +299,12 @@ class StellarLoop(Loop):
         searches = self.mode is Mode.ACQUISITION and not self.waits_for
         if not searches or attribution is None or attribution.candidate is None:
             return []
-        motor_rad = self.servo.position_at(time_s)
-        beam_rad = self.star_motion.beam_at(time_s, motor_rad)
-        stages_px = self.star_finder.estimator.stages_px(beam_rad, self.mirror.at(time_s))
-        return self.star_finder.spots(attribution.moved_px(stages_px))
+        return self.star_finder.spots(attribution.moved_px(self._stages_px_at(time_s)))
+
+    def _stages_px_at(self, time_s: float) -> AzEl:
+        """How far the stages move the star at a recent time."""
+        beam_rad = self.star_motion.beam_at(time_s, self.servo.position_at(time_s))
+        return self.star_finder.estimator.stages_px(beam_rad, self.mirror.at(time_s))
 
     def _evaluate_findings(self, observation: Observation) -> None:
         """Errors of devices, and what the frame means for the mode."""
@@ -323,7 +326,13 @@ class StellarLoop(Loop):
 
     def _find_trigger(self, frame: Frame, star: Star | None) -> Finding | None:
         if self.mode is Mode.ACQUISITION:
-            return self.search.evaluate(star, frame.mid_exposure_s)
+            others = {
+                other.name: OtherStages(
+                    other._stages_px_at(frame.mid_exposure_s), rest=other.mode not in TRACKING
+                )
+                for other in self.others
+            }
+            return self.search.evaluate(star, others, frame.mid_exposure_s)
         if self.mode in FOLLOWING:
             return self._find_unmoved(star) or self.following.evaluate(
                 self.mode, star, self.pointing.command_px

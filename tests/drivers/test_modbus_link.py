@@ -92,6 +92,19 @@ def test_a_station_that_answers_without_end_is_given_up():
             link.ask(request())
 
 
+def test_a_station_that_answers_everything_twice_is_not_given_up():
+    def answer_twice(client):
+        while data := client.recv(12):
+            number = int.from_bytes(data[:2], "big")
+            client.sendall(2 * frame(number, 1, bytes.fromhex("03 02 00 07")))
+
+    with scripted_server(answer_twice) as port:
+        link = link_to(port)
+        answers = [link.ask(request()) for _ in range(300)]
+        link.close()
+    assert answers == 300 * [bytes.fromhex("03 02 00 07")]
+
+
 def test_answers_that_all_come_late_are_none_too_many():
     def answer_late(client):
         numbers = [client.recv(12)[:2] for _ in range(300)]

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,13 @@ from fitctl.messages.modes import FOLLOWING, Mode
 from fitctl.model.optics import AzEl
 
 Floats = NDArray[np.float64]
+
+
+class OtherStages(NamedTuple):
+    """Of another loop whose star may be on the frame, at the exposure."""
+
+    moved_px: AzEl  # how far they move its star
+    rest: bool  # they follow no star and search for none; only a jog moves them
 
 
 class Attribution:
@@ -51,6 +59,7 @@ class Attribution:
         self._strangers_px: deque[AzEl] = deque(maxlen=MOST_STRANGERS)
         self._rejected = 0
         self._last_stages_px = 0.0, 0.0
+        self._others: Mapping[str, OtherStages] = {}  # on the frame that showed the candidate
 
     def begin_search(self) -> None:
         """A new search: the loop has no candidate."""
@@ -97,17 +106,28 @@ class Attribution:
 
     # ------------------------------------------------------------ the second look
 
-    def propose(self, star: Star) -> Floats:
+    def propose(self, star: Star, others: Mapping[str, OtherStages]) -> Floats:
         """A frame shows a candidate: where the siderostat is to bring it, shape (2,)."""
-        self.candidate = star
+        self.candidate, self._others = star, others
         self._estimator.suppose(star[:2], self._last_stages_px)
         place_px: Floats = self._looks_px[second_look(self._looks_px, *star[:2], self._rejected)]
         return place_px
 
-    def has_moved(self, star: Star) -> bool:
-        """What the second look shows, where the candidate is expected now, has left the candidate's place."""
-        candidate = self.candidate
-        return candidate is not None and not is_within(*star[:2], *candidate[:2], HALF_WINDOW_PX)
+    def has_moved(self, star: Star, others: Mapping[str, OtherStages]) -> bool:
+        """What the second look shows, where the candidate is expected now, was moved by the own stages alone.
+
+        It has left the candidate's place, and is not where another loop's stages, which rest, would have taken
+        it: a jog may take that loop's star to where the own one is expected.
+        """
+        if self.candidate is None:
+            return False
+        az_px, el_px, *_ = self.candidate
+        places_px = [(az_px, el_px)]
+        for name, (now_px, rest) in others.items():
+            then_px = self._others[name].moved_px
+            if rest:
+                places_px.append((az_px + now_px[0] - then_px[0], el_px + now_px[1] - then_px[1]))
+        return not any(is_within(*star[:2], *place_px, HALF_WINDOW_PX) for place_px in places_px)
 
     def confirm(self) -> None:
         """The candidate is the loop's own star."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from fitctl.config import LEAST_OVERLAP, MOST_OVERLAP, AxisPair, Rig
 from fitctl.controllers.centroid import LARGEST_PEAK, Star
 from fitctl.controllers.spiral import SpiralPlan, plan_spiral
-from fitctl.loop.search.attribution import Attribution
+from fitctl.loop.search.attribution import Attribution, OtherStages
 from fitctl.loop.search.finder import StarFinder
 from fitctl.loop.search.spiral import (
     SpiralSearch,
@@ -112,26 +113,35 @@ class StarSearch(SpiralSearch):
             radius_sky_arcsec=asked.search_radius_sky_arcsec,
         )
 
-    def evaluate(self, star: Star | None, now_s: float) -> Finding | None:
-        """What a frame exposed at `now_s` means for the search."""
+    def evaluate(
+        self, star: Star | None, others: Mapping[str, OtherStages], now_s: float
+    ) -> Finding | None:
+        """What a frame exposed at `now_s` means for the search.
+
+        `others` are the stages of the loops whose stars may be on the same frame, by name, at its exposure.
+        """
         if not self._arrived:
             return self._wait_for_siderostat(now_s)
         if self._attribution is not None:
-            return self._look_at_candidate(self._attribution, star, now_s)
+            return self._look_at_candidate(self._attribution, star, others, now_s)
         if star is None:
             return self.look(False, self.centre_rad, now_s)
         return self.look(True, self._star_in_the_middle_rad(), now_s)
 
     def _look_at_candidate(
-        self, attribution: Attribution, star: Star | None, now_s: float
+        self,
+        attribution: Attribution,
+        star: Star | None,
+        others: Mapping[str, OtherStages],
+        now_s: float,
     ) -> Finding | None:
         """The star may be another loop's: the second look shows whether it moves with this loop's stages."""
         if attribution.candidate is None:
             if star is None:
                 return self.look(False, self.centre_rad, now_s)
-            place_px = attribution.propose(star)
+            place_px = attribution.propose(star, others)
             return self.look(True, self._estimator.motor_for_rad(place_px, np.zeros(2)), now_s)
-        has_moved = star is not None and attribution.has_moved(star)
+        has_moved = star is not None and attribution.has_moved(star, others)
         finding = self.look(has_moved, self.centre_rad, now_s)
         if finding is not None and finding.trigger is None:
             attribution.reject()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fitctl.config import default_rig_path, load_rig
-from fitctl.messages.commands import Acquire, Release, SetTarget, Standby
+from fitctl.messages.commands import Acquire, Jog, Release, SetTarget, Standby
 from fitctl.messages.modes import Mode
 from fitctl.simulation.simulation import Simulation
 from fitctl.simulation.statistics import true_residual_rms
@@ -103,6 +103,26 @@ def test_a_star_that_does_not_move_with_the_loops_stages_is_not_its_own():
     simulation.until(RIGHT, Mode.VERNIER)
     simulation.run(5.0)
     assert simulation.star_px(RIGHT) == pytest.approx(TARGET_PX[RIGHT], abs=0.5)
+
+
+def test_a_star_that_is_jogged_to_where_the_candidate_is_expected_is_not_its_own(held):
+    """Only the star of right is on the frame, and goes as the stages of left do."""
+    held.command(Release())
+    held.light(right=1.0, left=0.0)
+    held.command(Acquire(loop=LEFT))
+    left, right = held.loop(LEFT), held.loop(RIGHT)
+    while left.star_finder.attribution.candidate is None:
+        held.run(0.02)
+        assert left.mode is Mode.ACQUISITION
+    moves_px = TARGET_PX[LEFT] - held.star_px(RIGHT)
+    per_rad = right.settings.siderostat.sky_arcsec_per_motor_rad
+    az, el = (per_rad * right._scale.motor_rad(moves_px)).tolist()
+    held.command(Jog(loop=RIGHT, az_sky_arcsec=az, el_sky_arcsec=el))
+    since_s = held.clock.now_s()
+    held.run(1.5)
+    assert held.star_px(RIGHT) == pytest.approx(TARGET_PX[LEFT], abs=2.0)
+    held.run(5.0)
+    assert not [change for change in held.mode_changes if change.time_s > since_s]
 
 
 def test_a_star_that_vanishes_is_lost_though_another_is_on_the_frame(held):
