@@ -118,7 +118,6 @@ def _done(course: Course, task: Task) -> Entry:
                 f"with what was found, the rig file contradicts itself: {error}; correct it by hand"
             )
             outcome = Outcome(outcome.lines, outcome.figures, {}, what)
-            found = {}
             break
         if outcome.estimated:
             break
@@ -127,8 +126,9 @@ def _done(course: Course, task: Task) -> Entry:
             outcome = Outcome(outcome.lines, outcome.figures, found, what)
     figures = outcome.figures if outcome.estimated else outcome.figures | first
     earlier = course.record.tasks.get(task.name)
-    if earlier is not None and outcome.trouble and not found:
-        found = earlier.found  # a failure says nothing against it
+    if outcome.trouble:
+        # Nothing has confirmed what was found now, and nothing speaks against what was found before.
+        found = {} if earlier is None else earlier.found
     whole = replace(outcome, lines=lines, figures=figures, found=found)
     if earlier is not None and earlier.found != found:
         _forget_dependents(course, task)

@@ -115,6 +115,27 @@ def test_a_correction_that_helps_nothing_fails(course, table):
     assert "still not as expected" in entry.trouble
 
 
+@pytest.mark.parametrize("before", [{}, GEAR])
+def test_a_correction_that_no_second_measurement_confirms_is_not_kept(course, table, before):
+    measured = iter([26.0, 27.0])
+
+    def corrects_once(_site):
+        if (gear := next(measured, None)) is None:
+            msg = "the star has left the field"
+            raise StepError(msg)
+        return Outcome(found={"loops": {"right": {"siderostat": {"spur_gear_ratio": gear}}}})
+
+    if before:
+        table(gear=step(corrects_the_gear))
+        do(course, task(course, "gear"))
+    table(gear=step(corrects_once))
+    entry = do(course, task(course, "gear"))
+    assert (entry.state, entry.trouble) == ("failed", "the star has left the field")
+    assert entry.found == before
+    gear = (before and 26.0) or 25.0
+    assert load_rig(course.files.rig).loops["right"].siderostat.spur_gear_ratio == gear
+
+
 def test_a_correction_that_the_rig_file_contradicts_is_named_and_not_written(course, table):
     far = {"loops": {"right": {"siderostat": {"spur_gear_ratio": 40.0}}}}
     table(gear=step(lambda _site: Outcome(found=far)))

@@ -246,6 +246,7 @@ CONTRADICTIONS = [
       f"{MOTORS}.velocity_limit_rad_s"),
     ({f"{MOTORS}.travel_sky_arcsec": 2000.0}, f"{DRIVE}.position_limit_rad"),
     ({f"{DRIVE}.position_limit_rad": 50.0}, f"{MOTORS}.travel_sky_arcsec"),
+    ({f"{DRIVE}.position_limit_rad": 4e6}, f"{MOTORS}.encoder_counts_per_rev"),
     ({f"{MOTORS}.spur_gear_ratio": 50.0}, f"{MOTORS}.travel_sky_arcsec"),
     ({f"{MOTORS}.backlash_sky_arcsec": 5000.0}, f"{MOTORS}.travel_sky_arcsec"),
     ({f"{SEARCH}.search_radius_sky_arcsec": 1300.0}, f"{MOTORS}.travel_sky_arcsec"),

@@ -7,7 +7,7 @@ from itertools import pairwise
 from stalls import stalls
 
 from .entries.entry import HOLDS, SEARCHES, STAYED, WAITS
-from .strikes import strike
+from .strikes import goes_on, strike
 from .watched import modes_of
 
 STAYING = {STAYED, HOLDS, WAITS}  # ends of other loops
@@ -77,7 +77,9 @@ def attempted(rig, entry, home, stalled):
     rig.loop = entry.loop
     rig.reach(home | {entry.loop: entry.mode})
     if entry.struck in PROCESSES:
-        rig.process(entry.struck)  # a console is opened, a recorder may just be starting
+        # Before the clock runs: a console is opened, a recorder or a gateway may just be starting.
+        rig.process(entry.struck)
+        goes_on(rig, entry)
     hold_all(rig, entry)
     wait_until_over(rig, entry.says)
     deaf = entry.struck == "supervisor" and entry.how != "slowed"

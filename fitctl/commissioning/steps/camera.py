@@ -10,10 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.commissioning.outcome import Outcome, Site, StepError
+from fitctl.config import Camera
 from fitctl.daemon.devices import CAMERAS
 from fitctl.drivers.interface import CameraDriver, DeviceError, Frame
 
 FRAMES = 150
+_LEAST_IMAGES, _MOST_IMAGES_BYTES = 10, 128 << 20  # kept of them
 _TIMEOUT_S = 1.0
 _BIAS_SIGMAS = 0.5  # of one pixel's noise; the median over all pixels is much better known
 _NOISE_APART = 0.25
@@ -22,6 +24,7 @@ _DELAY_APART_S = 0.004
 _LOST = 0.01
 _HOT_SIGMAS = 20.0
 _OF_A_SPOT = 0.2  # of a pixel's light: a neighbour of a hot one has less
+_COSMIC_RAYS = 2  # that may meet one pixel in so many images
 
 
 @contextmanager
@@ -54,9 +57,9 @@ def check_camera(site: Site) -> Outcome:
     """
     settings = site.rig.camera
     with streaming(site) as camera:
-        frames = _take(camera, FRAMES)
+        frames = _take(camera, FRAMES, _kept_images(settings))
         counts = camera.counts()
-    images = np.array([frame.image for frame in frames], dtype=float)
+    images = np.array([frame.image for frame in frames if frame.image.size])
     exposed_s = np.array([frame.mid_exposure_s for frame in frames])
     numbers = np.array([frame.number for frame in frames])
     delays_s = np.array([frame.received_s for frame in frames]) - exposed_s
@@ -64,8 +67,8 @@ def check_camera(site: Site) -> Outcome:
     hot = _hot_pixels(middle, settings.pixel_noise_dn)
     figures = {
         "bias_dn": float(np.median(middle)),
-        "noise_dn": float(np.median(1.4826 * np.median(np.abs(images - middle), axis=0))),
-        "brightest_dn": float(images.max()),
+        "noise_dn": 1.4826 * float(np.median(_deviations(images, middle))),
+        "brightest_dn": _brightest(images, hot),
         "hot_pixels": float(len(hot)),
         "frame_rate_hz": float(np.ptp(numbers) / np.ptp(exposed_s)),
         "frame_delay_s": float(np.median(delays_s)),
@@ -92,13 +95,35 @@ def check_camera(site: Site) -> Outcome:
     return Outcome(lines, figures, {"camera": found} if found else {})
 
 
-def _take(camera: CameraDriver, count: int) -> list[Frame]:
+def _kept_images(camera: Camera) -> int:
+    """How many images are evaluated: as many as the memory of a small computer has room for."""
+    image_bytes = 2 * camera.width_px * camera.height_px
+    return max(_LEAST_IMAGES, min(FRAMES, _MOST_IMAGES_BYTES // image_bytes))
+
+
+def _deviations(images: NDArray[np.uint16], middle: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Median absolute deviation of each pixel; row by row, which needs little memory."""
+    rows = zip(images.swapaxes(0, 1), middle, strict=True)
+    return np.array([np.median(np.abs(row - row_middle), axis=0) for row, row_middle in rows])
+
+
+def _brightest(images: NDArray[np.uint16], hot: list[tuple[int, int]]) -> float:
+    """The most light that pixels have which are not hot, apart from cosmic rays."""
+    often = np.partition(images, -1 - _COSMIC_RAYS, axis=0)[-1 - _COSMIC_RAYS]
+    for az, el in hot:
+        often[el, az] = 0
+    return float(often.max())
+
+
+def _take(camera: CameraDriver, count: int, images: int) -> list[Frame]:
+    """So many frames; the later ones without their image."""
     frames: list[Frame] = []
     missed = 0
     while len(frames) < count:
         frame = camera.next_frame(_TIMEOUT_S)
         if frame is not None:
-            frames.append(frame._replace(image=frame.image.copy()))
+            image = frame.image if len(frames) < images else frame.image[:0]
+            frames.append(frame._replace(image=image.copy()))
             continue
         missed += 1
         if missed > 2:

@@ -21,10 +21,12 @@ from fitctl.commissioning.steps.plate import (
     uneven_line,
 )
 from fitctl.commissioning.steps.sky import Watch, displaced
+from fitctl.config import Fsm
 from fitctl.controllers.mirror import Mirror
 from fitctl.model.optics import gains_of, scales, stage_turn
 
-STACK_V = 2.5
+_STACK_V = 2.5
+_OF_RANGE = 0.9  # of what tilts the mirror by its range: where that is less, so far
 _SWINGS = 3
 _SURELY_EXCHANGED = 0.15  # better in `_unlike`; with even axes, another order is better by 0.45
 _SAME_SCALE = 0.1  # by which two stages' scales may differ and have one cause
@@ -32,11 +34,17 @@ _SAME_SCALE = 0.1  # by which two stages' scales may differ and have one cause
 
 def moves(site: Site) -> str:
     """What the step moves."""
-    gain = site.loop.fsm.piezo.gain
+    fsm = site.loop.fsm
+    volts = _stack_v(fsm)
     return (
-        f"each stack by {STACK_V:g} V at the D/A both ways, {gain * STACK_V:g} V at the stack, "
-        "one after the other"
+        f"all stacks to {fsm.bias_v:g} V at the D/A, then each by {volts:.3g} V both ways, "
+        f"{fsm.piezo.gain * volts:.3g} V at the stack, one after the other"
     )
+
+
+def _stack_v(fsm: Fsm) -> float:
+    """How far a stack is moved from its bias, at the D/A."""
+    return min(_STACK_V, _OF_RANGE * fsm.swing_v)
 
 
 def check_mirror(site: Site) -> Outcome:
@@ -55,7 +63,7 @@ def check_mirror(site: Site) -> Outcome:
         held.slew(np.full(3, fsm.bias_v), fsm.slew_v_per_s)
         seen, expected = [], []
         for stack in range(3):
-            site.report(f"stack {stack + 1}: {STACK_V:g} V both ways")
+            site.report(f"stack {stack + 1}: {_stack_v(fsm):.3g} V both ways")
             moved_px, modelled_px = _swing(site, watch, held, model, stack)
             seen.append(moved_px)
             expected.append(modelled_px)
@@ -78,7 +86,7 @@ def _swing(
     for swing in range(_SWINGS + 1):
         places, angles = [], []
         for way in (-1.0, 1.0):
-            goal_v = bias_v + way * STACK_V * np.eye(3)[stack]
+            goal_v = bias_v + way * _stack_v(fsm) * np.eye(3)[stack]
             held.slew(goal_v, fsm.slew_v_per_s)
             model.written(goal_v)
             if swing:
@@ -102,7 +110,7 @@ def _refuse_another_star(site: Site, watch: Watch, held: stacks.Stacks) -> None:
     fsm = site.loop.fsm
     bias_v = np.full(3, fsm.bias_v)
     before = watch.places_px(12)
-    held.slew(bias_v + STACK_V * np.eye(3)[0], fsm.slew_v_per_s)
+    held.slew(bias_v + _stack_v(fsm) * np.eye(3)[0], fsm.slew_v_per_s)
     held.set(held.volts)
     after = watch.places_px(12)
     held.slew(bias_v, fsm.slew_v_per_s)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fitctl.commissioning.outcome import Outcome, Site, StepError
 from fitctl.commissioning.steps.camera import streaming
 from fitctl.commissioning.steps.motors import powered
-from fitctl.commissioning.steps.sky import Watch, displaced, search, to_the_star
+from fitctl.commissioning.steps.sky import Watch, displaced, search, search_extent, to_the_star
 from fitctl.config.wiring import STRAIGHT
 from fitctl.controllers.centroid import Star
 from fitctl.model.optics import gains_of, scales
@@ -70,13 +70,12 @@ def uneven_line(off: Similar) -> str:
 # ---------------------------------------------------------------- the star
 def star_moves(site: Site) -> str:
     """What the step moves."""
-    reach = site.loop.acquisition.search_radius_sky_arcsec
-    motor = site.loop.siderostat.sky_arcsec_per_motor_rad
+    step_rad, turns = search_extent(site)
     if len(site.rig.stellar_loops) > 1:
         first = f"azimuth by {ROUGH_RAD:g} rad, to see which star it moves; if none"
     else:
         first = "nothing if the star is on the camera; otherwise"
-    return f"{first} the motors, up to {reach / motor:.1f} rad each way"
+    return f"{first} the motors, up to {turns * step_rad:.1f} rad each way"
 
 
 def check_star(site: Site) -> Outcome:

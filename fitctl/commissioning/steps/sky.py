@@ -200,6 +200,15 @@ def displaced(before: list[Floats], after: list[Floats]) -> tuple[Floats, Floats
     return (gone[0], come[0]) if len(gone) == len(come) == 1 else None
 
 
+def search_extent(site: Site) -> tuple[float, int]:
+    """Between two looks of a search, motor angle in radians; and how many of these it goes each way at most."""
+    scale = scales(site.rig, site.loop)
+    camera = site.rig.camera
+    step_rad = 0.6 * min(camera.width_px, camera.height_px) / scale.motor_px_per_rad
+    reach_px = site.loop.acquisition.search_radius_sky_arcsec / scale.sky_arcsec_per_px
+    return step_rad, math.ceil(reach_px / scale.motor_px_per_rad / step_rad)
+
+
 def search(site: Site, watch: Watch, others: list[Star] | None = None) -> tuple[Star, int]:
     """The brightest spot, on the frame or on a square spiral about it; and after how many looks.
 
@@ -215,11 +224,7 @@ def search(site: Site, watch: Watch, others: list[Star] | None = None) -> tuple[
     star = watch.brightest()
     if star is not None and not still:
         return to_the_star(site, watch, star, still), 0
-    scale = scales(site.rig, site.loop)
-    camera = site.rig.camera
-    step_rad = 0.6 * min(camera.width_px, camera.height_px) / scale.motor_px_per_rad
-    reach_px = site.loop.acquisition.search_radius_sky_arcsec / scale.sky_arcsec_per_px
-    turns = math.ceil(reach_px / scale.motor_px_per_rad / step_rad)
+    step_rad, turns = search_extent(site)
     centre_rad = watch.goal_rad.copy()
     for looks, (right, up) in enumerate(square_spiral(turns), start=1):
         site.report(f"look {looks}: az {right * step_rad:+.1f}, el {up * step_rad:+.1f} rad")

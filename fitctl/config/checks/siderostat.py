@@ -94,6 +94,20 @@ def _travel(siderostat: AnySiderostat) -> Iterator[Conflict]:
                 *_geometry(siderostat, limit_rad / travel_rad),
             ),
         )
+    if isinstance(device, Cia402Device):
+        limit_rad = device.position_limit_rad
+        counts = limit_rad / siderostat.encoder_count_rad
+        if counts > _INT32:
+            per_rev = siderostat.encoder_counts_per_rev
+            yield Conflict(
+                f"the drive's own limit would be {counts:.0f} counts, and it counts to {_INT32}",
+                (
+                    at_most("device.position_limit_rad", limit_rad, limit_rad * _INT32 / counts),
+                    at_most(
+                        "encoder_counts_per_rev", per_rev, math.floor(per_rev * _INT32 / counts)
+                    ),
+                ),
+            )
     counts = travel_rad / siderostat.encoder_count_rad
     most = {Cia402Device: _INT32, BalAnalogDevice: _HALF_COUNTER}.get(type(device), math.inf)
     if counts > most:

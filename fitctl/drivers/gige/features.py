@@ -207,7 +207,8 @@ class Features:
         """Each of them: `TriggerMode` is that of the one selected."""
         selectors: tuple[str, ...] = ()
         if self._nodes.has_node("TriggerSelector"):
-            selectors = self._nodes.get_node("TriggerSelector").symbolics
+            with self._read("TriggerSelector") as node:
+                selectors = node.symbolics
         for selector in selectors:
             self._set_if_writable("TriggerSelector", selector)
             self._set_if_writable("TriggerMode", "Off")
@@ -252,8 +253,9 @@ class Features:
     def _set_if_writable(self, name: str, value: float | str | bool) -> None:
         """Set a feature that not every camera has, or has fixed."""
         if self._nodes.has_node(name):
-            node = self._nodes.get_node(name)
-            if node.get_access_mode() in self._writable:
+            with self._read(name) as node:
+                writable = node.get_access_mode() in self._writable
+            if writable:
                 self._set(name, value)
 
     @contextlib.contextmanager

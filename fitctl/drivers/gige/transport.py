@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import select
 import socket
 import time
@@ -9,13 +10,14 @@ import time
 from fitctl.drivers.gige import protocol
 from fitctl.drivers.gige.gvcp import ControlChannel
 from fitctl.drivers.gige.protocol import Register
-from fitctl.drivers.interface import DeviceMismatch, DeviceRefused
+from fitctl.drivers.interface import DeviceMismatch, DeviceRefused, DeviceUnreachable
 
 RECEIVE_BUFFER_BYTES = 4 << 20  # the kernel grants what net.core.rmem_max allows
 _SMALLEST_BYTES = 576  # what every network passes
 _TESTS = 3
 _TEST_S = 0.05
 _PACKET_BYTES_MAX = 65536
+_LARGEST_REGISTER = 0xFFFFFFFF
 
 
 def open_stream(channel: ControlChannel) -> socket.socket:
@@ -24,7 +26,7 @@ def open_stream(channel: ControlChannel) -> socket.socket:
     try:
         stream.setblocking(False)
         stream.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
-        stream.bind((channel.local_address, 0))
+        _bind(channel, stream)
         host, port = stream.getsockname()
         address = int.from_bytes(socket.inet_aton(host), "big")
         channel.write_register(Register.STREAM_DESTINATION, address)
@@ -33,6 +35,19 @@ def open_stream(channel: ControlChannel) -> socket.socket:
         stream.close()
         raise
     return stream
+
+
+def _bind(channel: ControlChannel, stream: socket.socket) -> None:
+    """To the address from which the camera is reached, which the host may have lost meanwhile."""
+    try:
+        stream.bind((channel.local_address, 0))
+    except OSError as error:
+        raise channel.endpoint.error(
+            DeviceUnreachable,
+            f"the host to receive at {channel.local_address}",
+            str(error),
+            "check the network interface that leads to the camera",
+        ) from error
 
 
 def set_packet_size(channel: ControlChannel, size_bytes: int) -> None:
@@ -85,11 +100,14 @@ def set_packet_delay(channel: ControlChannel, delay_s: float, ticks_per_s: int) 
     Raises
     ------
     DeviceMismatch
-        If the camera refuses it, or has no clock to count it. No delay is always right.
+        If the camera refuses it, or has no clock that can count it. No delay is always right.
     """
     got = "" if ticks_per_s else "a camera without a clock to count it"
+    ticks = round(delay_s * ticks_per_s)
+    if ticks > _LARGEST_REGISTER:
+        got, ticks = f"a camera with a clock of {ticks_per_s} Hz, too fast to count it", 0
     try:
-        channel.write_register(Register.STREAM_PACKET_DELAY, round(delay_s * ticks_per_s))
+        channel.write_register(Register.STREAM_PACKET_DELAY, ticks)
     except DeviceRefused as error:
         got = error.got
     if got and delay_s:
@@ -112,7 +130,9 @@ def _arrives(channel: ControlChannel, stream: socket.socket, size_bytes: int) ->
             return False
         deadline_s = time.monotonic() + _TEST_S
         while (left_s := deadline_s - time.monotonic()) > 0 and poll.poll(left_s * 1000):
-            length = len(stream.recv(_PACKET_BYTES_MAX))
+            length = 0
+            with contextlib.suppress(BlockingIOError):  # its checksum was wrong
+                length = len(stream.recv(_PACKET_BYTES_MAX))
             if length == size_bytes - protocol.TEST_PACKET_OVERHEAD_BYTES:
                 return True
     return False

@@ -148,6 +148,14 @@ def test_each_step_says_what_moves_and_asks_once_and_no_ends_it_there(at_termina
     assert tasks(tmp_path) == {"right.one": "passed", "right.two": "passed"}
 
 
+def test_with_json_too_each_step_says_what_moves_before_it_asks(at_terminal):
+    terminal = at_terminal("--json")
+    terminal.wait_for("Moves: the one motor.")
+    terminal.answer("no")
+    assert terminal.end() == 1
+    assert json.loads(terminal.text.splitlines()[-1])["verdict"].startswith("not commissioned")
+
+
 def test_a_step_is_skipped_with_a_reason_and_what_needs_it_may_be_done(at_terminal, tmp_path):
     terminal = at_terminal("--until", "two")
     terminal.answer("skip")

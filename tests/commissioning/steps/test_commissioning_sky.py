@@ -7,6 +7,7 @@ from commissioning.motor_bench import RIG, BenchAmplifiers, site_of
 from fitctl.clock import VirtualClock
 from fitctl.commissioning.outcome import StepError
 from fitctl.commissioning.steps.motors import Motors
+from fitctl.commissioning.steps.plate import star_moves
 from fitctl.commissioning.steps.sky import Watch, displaced, search
 from fitctl.controllers.centroid import Star
 from fitctl.model.optics import scales
@@ -104,6 +105,24 @@ def test_the_spot_beside_a_star_is_not_taken_for_the_star(el_px):
     assert star.flux_dn == LOOP.star_flux_dn
     assert looks == 0
     assert sky.brightest().flux_dn == LOOP.star_flux_dn  # and it stays on the frame
+
+
+def test_the_search_goes_as_far_as_the_step_says_before():
+    class Nowhere:
+        motors = None
+        goal_rad = np.zeros(2)
+        farthest_rad = 0.0
+
+        def brightest(self, *_):
+            return None
+
+        def turn_to(self, goal_rad):
+            self.farthest_rad = max(self.farthest_rad, *np.abs(goal_rad))
+
+    watch = Nowhere()
+    with pytest.raises(StepError, match="no star"):
+        search(site_of(), watch)
+    assert f"up to {watch.farthest_rad:.1f} rad each way" in star_moves(site_of())
 
 
 @pytest.mark.parametrize("part", [0.4, 0.5])

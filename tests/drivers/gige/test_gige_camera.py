@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Callable
 from itertools import pairwise
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ from gige_served import IMAGE, Served, camera_settings, mock_settings, received
 from numpy.typing import NDArray
 
 from fitctl.config import Camera
-from fitctl.drivers.gige import protocol
+from fitctl.drivers.endpoint import Endpoint
+from fitctl.drivers.gige import protocol, transport
 from fitctl.drivers.gige.discovery import discover
 from fitctl.drivers.gige.driver import GigeCamera
 from fitctl.drivers.interface import (
@@ -84,6 +86,50 @@ def test_a_delay_between_packets_is_set_and_kept(serve: Serve, connect: Connect)
 def test_a_delay_that_no_clock_can_count_is_a_mismatch(serve: Serve, connect: Connect) -> None:
     with pytest.raises(DeviceMismatch, match=r"0\.001 s between packets.*without a clock"):
         connect(serve(mock=mock_settings(clock=False)), packet_delay_s=0.001)
+
+
+def test_so_is_one_that_a_fast_clock_cannot_count() -> None:
+    class Channel:
+        endpoint = Endpoint("camera", "127.0.0.1:3956")
+        written: ClassVar[list[int]] = []
+
+        def write_register(self, _address: int, value: int) -> None:
+            self.written.append(value)
+
+    with pytest.raises(DeviceMismatch, match=r"0\.01 s between packets.*1000000000000 Hz"):
+        transport.set_packet_delay(Channel(), 0.01, 10**12)
+    assert all(value < 2**32 for value in Channel.written)
+
+
+def test_an_address_that_the_host_no_longer_has_is_named() -> None:
+    class Channel:
+        endpoint = Endpoint("camera", "192.0.2.2:3956")
+        local_address = "192.0.2.1"
+
+    with pytest.raises(DeviceUnreachable, match=r"receive at 192\.0\.2\.1.*network interface"):
+        transport.open_stream(Channel())
+
+
+def test_a_test_packet_that_the_kernel_drops_when_it_is_read_has_not_arrived() -> None:
+    """Linux reports a datagram with a wrong checksum as one to read, and then has none."""
+
+    class Channel:
+        def write_register(self, _address: int, _value: int) -> None:
+            pass
+
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+    theirs.send(bytes(1472))
+
+    class Stream:
+        fileno = ours.fileno
+
+        def recv(self, count: int) -> bytes:
+            ours.recv(count)
+            raise BlockingIOError
+
+    assert not transport._arrives(Channel(), Stream(), 1500)
+    ours.close()
+    theirs.close()
 
 
 def test_a_camera_is_discovered(serve: Serve) -> None:

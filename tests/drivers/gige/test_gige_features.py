@@ -194,6 +194,15 @@ class Registers(Memory):
             self.write_register(address + at, int.from_bytes(data[at : at + 4], "big"))
 
 
+def test_a_feature_whose_access_cannot_be_evaluated_is_named() -> None:
+    auto = '<Enumeration Name="GainAuto">'
+    text = richer_description().replace(auto, f"{auto}<pIsLocked>Locked</pIsLocked>")
+    locked = '<IntSwissKnife Name="Locked"><Formula>1 / 0</Formula></IntSwissKnife>'
+    text = text.replace("</RegisterDescription>", f"{locked}</RegisterDescription>")
+    with pytest.raises(DeviceMismatch, match="GainAuto"):
+        Features(Registers(text, {})).configure(camera_settings())
+
+
 def test_nothing_of_a_camera_stays_automatic() -> None:
     settings = camera_settings()
     pixels = settings.width_px * settings.height_px
