@@ -182,27 +182,34 @@ def check_cables(site: Site) -> Outcome:
     Raises
     ------
     StepError
-        If one does not, or the loop does not recover.
+        If one does not, or the loop does not recover. A cable that is off is put on again first.
     """
     lines: list[str] = []
     figures: dict[str, float] = {}
-    with supervised(site) as loop:
-        for cable in cables_of(site):
-            loop.acquire()
-            time.sleep(SETTLED_S)
-            site.cable(cable, False)
-            took_s = loop.wait_for(Mode.SAFE, SAFE_WITHIN_S)
-            loop.client.send(Stop())
-            site.cable(cable, True)
-            if math.isnan(took_s):
-                msg = (
-                    f"{cable.name} was off for {SAFE_WITHIN_S:g} s and the loop did not go to SAFE; do not "
-                    "operate the instrument, and see docs/interlocks.md"
-                )
-                raise StepError(msg, figures)
-            figures[f"{cable.mock.rpartition('.')[2]}_safe_s"] = took_s
-            lines.append(f"{cable.name}: SAFE {took_s:.2f} s after it was off")
-            _recover(cable, loop)
+    off: Cable | None = None
+    try:
+        with supervised(site) as loop:
+            for cable in cables_of(site):
+                loop.acquire()
+                time.sleep(SETTLED_S)
+                off = cable
+                site.cable(cable, False)
+                took_s = loop.wait_for(Mode.SAFE, SAFE_WITHIN_S)
+                loop.client.send(Stop())
+                site.cable(cable, True)
+                off = None
+                if math.isnan(took_s):
+                    msg = (
+                        f"{cable.name} was off for {SAFE_WITHIN_S:g} s and the loop did not go to SAFE; do not "
+                        "operate the instrument, and see docs/interlocks.md"
+                    )
+                    raise StepError(msg, figures)
+                figures[f"{cable.mock.rpartition('.')[2]}_safe_s"] = took_s
+                lines.append(f"{cable.name}: SAFE {took_s:.2f} s after it was off")
+                _recover(cable, loop)
+    finally:  # by now the supervisor has ended
+        if off is not None:
+            site.cable(off, True)
     return Outcome(lines, figures)
 
 
