@@ -72,6 +72,12 @@ class BenchAmplifiers:
         self._at_s = now_s
 
 
+def rig_with_limit(velocity_rad_s):
+    """The rig with slower motors."""
+    limit = f"loops.right.siderostat.velocity_limit_rad_s={velocity_rad_s}"
+    return load_rig(default_rig_path(), [limit])
+
+
 def site_of(rig=RIG, clock=None, name="right"):
     return Site(rig, name, lambda _line: None, Path("rig.toml"), (), clock=clock or VirtualClock())
 
@@ -79,12 +85,12 @@ def site_of(rig=RIG, clock=None, name="right"):
 def step_on_bench(monkeypatch, check):
     """Runs a step on amplifiers wired as told: gives the bench, the outcome, and why the step stopped."""
 
-    def run(**wiring):
+    def run(rig=RIG, **wiring):
         clock = VirtualClock()
         bench = BenchAmplifiers(clock, **wiring)
         monkeypatch.setattr(motors, "amplifiers_of", lambda _siderostat: bench)
         try:
-            return bench, check(site_of(RIG, clock)), ""
+            return bench, check(site_of(rig, clock)), ""
         except StepError as error:
             return bench, None, str(error)
 

@@ -175,6 +175,23 @@ def test_a_velocity_beyond_any_range_is_held_and_keeps_its_sign(bench, enabled):
     assert az > 0 > el
 
 
+@pytest.mark.parametrize("name", BACK_ENDS)
+def test_the_motors_turn_no_faster_than_their_limit(bench_of, name):
+    driver = bench_of(name, "loops.right.siderostat.velocity_limit_rad_s=5.0").driver
+    driver.open()
+    driver.enable()
+    exchange_for(driver, 0.15, FAST)
+    first = quick_reading_of(driver, FAST)
+    exchange_for(driver, 0.15, FAST)
+    second = quick_reading_of(driver, FAST)
+    lasted_s = second.time_s - first.time_s
+    turned = [
+        after - before
+        for before, after in zip(first.position_rad, second.position_rad, strict=True)
+    ]
+    assert turned == pytest.approx([5.0 * lasted_s, -5.0 * lasted_s], rel=0.1)
+
+
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf])
 def test_a_velocity_that_is_no_number_is_refused_and_moves_nothing(bench, enabled, wrong):
     for velocity in ((wrong, 0.0), (0.0, wrong)):

@@ -127,12 +127,13 @@ class Servo:
     def __init__(self, site: Site, motors: Motors) -> None:
         self._site, self._motors = site, motors
         motors.exchange(_STILL)
+        self._most_rad_s = within_limit(site, MOST_RAD_S)
         self.goal_rad = np.array(motors.position_rad)
 
     def hold(self) -> None:
         """One period."""
         apart = self.goal_rad - self._motors.position_rad
-        az, el = np.clip(_GAIN_PER_S * apart, -MOST_RAD_S, MOST_RAD_S).tolist()
+        az, el = np.clip(_GAIN_PER_S * apart, -self._most_rad_s, self._most_rad_s).tolist()
         self._motors.exchange((az, el))
 
     def turn_to(self, goal_rad: Floats) -> None:
@@ -155,7 +156,7 @@ class Servo:
             raise StepError(msg)
         began_rad = np.array(motors.position_rad)
         way_rad = np.max(np.abs(self.goal_rad - began_rad))
-        until_s = self._site.clock.now_s() + 2 * way_rad / MOST_RAD_S + 2.0
+        until_s = self._site.clock.now_s() + 2 * way_rad / self._most_rad_s + 2.0
         while np.max(np.abs(self.goal_rad - motors.position_rad)) > _THERE_RAD:
             self.hold()
             apart_rad = np.max(np.abs(self.goal_rad - motors.position_rad))
@@ -203,6 +204,11 @@ def powered(site: Site) -> Iterator[Motors]:
         with contextlib.suppress(DeviceError):
             amplifiers.exchange(_STILL)
         amplifiers.close()
+
+
+def within_limit(site: Site, velocity_rad_s: float) -> float:
+    """A velocity of the motors, or their limit in the rig file if that is lower."""
+    return min(velocity_rad_s, site.rig.loops[site.name].siderostat.velocity_limit_rad_s)
 
 
 def axis_name(axis: int) -> str:

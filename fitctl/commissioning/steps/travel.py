@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from fitctl.commissioning.outcome import Outcome, Site, StepError
-from fitctl.commissioning.steps.motors import Motors, axis_name, powered
+from fitctl.commissioning.steps.motors import Motors, axis_name, powered, within_limit
 
 OF_TRAVEL = 0.98  # both ends; the software limit itself is the supervisor's
 FAST_RAD_S = 12.0
@@ -22,8 +22,9 @@ def moves(site: Site) -> str:
     """What the step moves."""
     end_rad = OF_TRAVEL * site.rig.loops[site.name].siderostat.travel_rad
     return (
-        f"each motor to {end_rad:.1f} rad both ways, {OF_TRAVEL:.0%} of its travel, at {FAST_RAD_S:g} rad/s "
-        f"and over the last part of the way at {SLOW_RAD_S:g} rad/s; stopped as soon as it lags; then back"
+        f"each motor to {end_rad:.1f} rad both ways, {OF_TRAVEL:.0%} of its travel, at "
+        f"{within_limit(site, FAST_RAD_S):g} rad/s and over the last part of the way at "
+        f"{within_limit(site, SLOW_RAD_S):g} rad/s; stopped as soon as it lags; then back"
     )
 
 
@@ -82,7 +83,7 @@ def _turn(site: Site, motors: Motors, axis: int, goal_rad: float) -> float:
     looked_rad, wanted_rad = began_rad[axis], 0.0
     while abs(apart_rad := goal_rad - motors.position_rad[axis]) > _THERE_RAD:
         near_end = min(abs(goal_rad), motors.position_rad[axis] * math.copysign(1.0, goal_rad))
-        most_rad_s = SLOW_RAD_S if near_end > slow_beyond_rad else FAST_RAD_S
+        most_rad_s = within_limit(site, SLOW_RAD_S if near_end > slow_beyond_rad else FAST_RAD_S)
         velocity = max(-most_rad_s, min(most_rad_s, _GAIN_PER_S * apart_rad))
         try:
             motors.exchange((velocity, 0.0) if axis == 0 else (0.0, velocity))

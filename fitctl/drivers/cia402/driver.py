@@ -313,11 +313,10 @@ class Cia402Amplifiers(_Base):
         self._synchronize()
 
     def _command(self, velocity_rad_s: AzEl) -> None:
-        """Send both velocities and a SYNC, or leave the velocities for the bus's next SYNC."""
-        az_rad_s, el_rad_s = velocity_rad_s
+        """Send both velocities, within the motors' limit, and a SYNC; on a bus, leave them for its SYNC."""
+        az_rad_s, el_rad_s = self._commanded_rad_s = self._limited(velocity_rad_s)
         to_wire = protocol.velocity_to_wire
         rpdo = self._rpdo_id, _PAIR.pack(to_wire(az_rad_s), to_wire(el_rad_s))
-        self._commanded_rad_s = velocity_rad_s
         if self._bus_link is not None:
             self._bus_link.staged = rpdo
             return

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from commissioning.motor_bench import BenchAmplifiers, rig_with_limit, site_of
 
 from fitctl.clock import VirtualClock
 from fitctl.commissioning.outcome import Site, StepError
@@ -63,3 +64,15 @@ def test_motors_without_a_reading_are_not_commanded_to_move(monkeypatch):
         pass
 
     assert set(amplifiers.commanded) == {(0.0, 0.0)}
+
+
+def test_motors_turn_to_an_angle_no_faster_than_their_limit(monkeypatch):
+    clock = VirtualClock()
+    bench = BenchAmplifiers(clock)
+    monkeypatch.setattr(motors, "amplifiers_of", lambda _siderostat: bench)
+    site = site_of(rig_with_limit(1.0), clock)
+    with powered(site) as held:
+        Servo(site, held).turn_to((6.0, 0.0))
+
+    assert bench.motor_rad[0] == pytest.approx(6.0, abs=0.02)
+    assert bench.fastest_rad_s == 1.0

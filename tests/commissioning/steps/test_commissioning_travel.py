@@ -1,9 +1,9 @@
 """The step `travel`: to both ends and back, and where a motor stops before them."""
 
 import pytest
-from commissioning.motor_bench import RIG, step_on_bench
+from commissioning.motor_bench import RIG, rig_with_limit, site_of, step_on_bench
 
-from fitctl.commissioning.steps.travel import FAST_RAD_S, OF_TRAVEL, check_travel
+from fitctl.commissioning.steps.travel import FAST_RAD_S, OF_TRAVEL, check_travel, moves
 
 TRAVEL_RAD = RIG.loops["right"].siderostat.travel_rad
 
@@ -49,3 +49,13 @@ def test_a_motor_that_moves_with_the_other_is_named(step):
     bench, _, error = step(gains=((1, 0), (1, 1)))
     assert "elevation moved while azimuth was commanded" in error
     assert bench.furthest_rad < 1.0
+
+
+@pytest.mark.parametrize("limit_rad_s", [2.0, 5.0, 10.0])
+def test_the_motors_turn_no_faster_than_their_limit(step, limit_rad_s):
+    rig = rig_with_limit(limit_rad_s)
+    bench, _, error = step(rig, ends_rad=(-1e9, 8.0))
+    assert "azimuth stopped at +8.0 rad" in error
+    assert bench.fastest_rad_s == limit_rad_s
+    assert f"at {limit_rad_s:g} rad/s and" in moves(site_of(rig))
+    assert f"at {min(limit_rad_s, 3.0):g} rad/s;" in moves(site_of(rig))
