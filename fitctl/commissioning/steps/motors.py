@@ -6,7 +6,6 @@ are commanded to stand and lose their power.
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from fitctl.clock import Clock
 from fitctl.commissioning.outcome import Site, StepError
+from fitctl.commissioning.steps.ending import stopped_early
 from fitctl.daemon.devices import amplifiers_of
 from fitctl.drivers.amplifiers import AXES
 from fitctl.drivers.interface import AzEl, DeviceError, DeviceFault, ServoAmplifiers
@@ -26,6 +26,7 @@ _GAIN_PER_S = 15.0
 _THERE_RAD = 0.01
 _AWAY_RAD = 0.2
 _BLIND_S = 0.25  # without a reading for so long, nobody watches
+_MAY_HAVE_POWER = "a motor may still have power: press the emergency stop"
 
 
 class Motors:
@@ -126,8 +127,8 @@ class Servo:
 
     def __init__(self, site: Site, motors: Motors) -> None:
         self._site, self._motors = site, motors
-        motors.exchange(_STILL)
         self._most_rad_s = within_limit(site, MOST_RAD_S)
+        motors.exchange(_STILL)
         self.goal_rad = np.array(motors.position_rad)
 
     def hold(self) -> None:
@@ -181,17 +182,19 @@ def powered(site: Site) -> Iterator[Motors]:
     Raises
     ------
     StepError
-        If a device fails; its text is the device's own.
+        If a device fails; its text is the device's own. If a motor may still have power, the text says so.
     """
     siderostat = site.rig.loops[site.name].siderostat
     amplifiers = amplifiers_of(siderostat)
     motors = Motors(amplifiers, 1 / siderostat.servo.rate_hz, site.clock)
     try:
         amplifiers.open()
-        amplifiers.enable()
-        motors.wait_for_reading()
-        yield motors
-        amplifiers.exchange(_STILL)
+        with stopped_early(amplifiers.disable, amplifiers.open, _MAY_HAVE_POWER):
+            amplifiers.enable()
+            motors.wait_for_reading()
+            yield motors
+            amplifiers.exchange(_STILL)
+            amplifiers.disable()
     except DeviceFault as error:
         msg = (
             f"{error}. Where a motor ran away by itself, its encoder counts against it: exchange the encoder's "
@@ -201,8 +204,6 @@ def powered(site: Site) -> Iterator[Motors]:
     except DeviceError as error:
         raise StepError(str(error)) from None
     finally:
-        with contextlib.suppress(DeviceError):
-            amplifiers.exchange(_STILL)
         amplifiers.close()
 
 

@@ -13,6 +13,7 @@ from fitctl.clock import Clock
 from fitctl.commissioning.outcome import Outcome, Site, StepError
 from fitctl.daemon.devices import dac_of, piezo_of
 from fitctl.drivers.interface import DeviceError, MirrorDac, PiezoAmplifier
+from fitctl.processes import signals_ignored
 
 Floats = NDArray[np.float64]
 STEP_V = 0.3
@@ -90,9 +91,11 @@ def opened(site: Site) -> Iterator[Stacks]:
         stacks = Stacks(dac, piezo, site.clock)
         try:
             yield stacks
-        finally:
-            with contextlib.suppress(DeviceError):
+            stacks.slew(stacks.at_first_v, fsm.slew_v_per_s)
+        except BaseException:  # also an interrupt of the way back
+            with signals_ignored(), contextlib.suppress(DeviceError):
                 stacks.slew(stacks.at_first_v, fsm.slew_v_per_s)
+            raise
     except DeviceError as error:
         raise StepError(str(error)) from None
     finally:

@@ -1,5 +1,6 @@
-"""Motors with power: what is commanded before the encoders have been read."""
+"""Motors with power: what is commanded before the encoders have been read, and how they lose power."""
 
+import signal
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from fitctl.commissioning.outcome import Site, StepError
 from fitctl.commissioning.steps import motors
 from fitctl.commissioning.steps.motors import Servo, powered
 from fitctl.config import default_rig_path, load_rig
-from fitctl.drivers.interface import ServoReading
+from fitctl.drivers.interface import DeviceFault, DeviceProtocolError, ServoReading
 
 AT_RAD = (5.0, -3.0)
 
@@ -26,6 +27,9 @@ class LateAmplifiers:
         self._clock.sleep_until(self._clock.now_s() + 1.0)
 
     def enable(self):
+        pass
+
+    def disable(self):
         pass
 
     def close(self):
@@ -76,3 +80,109 @@ def test_motors_turn_to_an_angle_no_faster_than_their_limit(monkeypatch):
 
     assert bench.motor_rad[0] == pytest.approx(6.0, abs=0.02)
     assert bench.fastest_rad_s == 1.0
+
+
+# ---------------------------------------------------------------- how they lose power
+class Stubborn(BenchAmplifiers):
+    """Amplifiers that fail to disable `kept` times, or, `out_of_step`, until they are opened again.
+
+    The first `signals` attempts are interrupted.
+    """
+
+    def __init__(self, clock, kept=0, out_of_step=False, signals=0):
+        super().__init__(clock)
+        self.kept, self.out_of_step, self.signals = kept, out_of_step, signals
+        self.opened = 0
+
+    def open(self):
+        self.opened += 1
+        if self.opened > 1:
+            self.out_of_step = False
+
+    def disable(self):
+        if self.signals:
+            self.signals -= 1
+            signal.raise_signal(signal.SIGINT)
+        if self.out_of_step:
+            raise DeviceProtocolError("amplifiers", "nowhere", "one of %!#$", "b'1'", "recover")
+        if self.kept:
+            self.kept -= 1
+            raise DeviceFault(
+                "amplifiers", "nowhere", "azimuth disabled", "not within 1 s", "cut it"
+            )
+        super().disable()
+
+    def close(self):
+        pass
+
+
+@pytest.fixture
+def stubborn(monkeypatch):
+    """Makes such amplifiers and their site."""
+
+    def make(**how):
+        clock = VirtualClock()
+        bench = Stubborn(clock, **how)
+        monkeypatch.setattr(motors, "amplifiers_of", lambda _siderostat: bench)
+        return bench, site_of(clock=clock)
+
+    return make
+
+
+def end_of_step(site, step=lambda: None):
+    """What ends a step with powered motors."""
+    with pytest.raises((StepError, KeyboardInterrupt)) as caught, powered(site):
+        step()
+    return caught.value
+
+
+def stops():
+    raise StepError("a stop", {"furthest_rad": 1.0})
+
+
+def interrupted():
+    raise KeyboardInterrupt
+
+
+def test_amplifiers_that_keep_power_fail_a_step_that_went_well(stubborn):
+    _, site = stubborn(kept=10)
+    assert str(end_of_step(site)) == (
+        "amplifiers at nowhere: expected azimuth disabled, got not within 1 s; cut it; "
+        "a motor may still have power: press the emergency stop"
+    )
+
+
+def test_amplifiers_that_keep_power_are_named_after_what_ended_the_step(stubborn):
+    _, site = stubborn(kept=10)
+    ended = end_of_step(site, stops)
+    assert str(ended).startswith("a stop; amplifiers at nowhere: expected azimuth disabled")
+    assert str(ended).endswith("press the emergency stop")
+    assert ended.figures == {"furthest_rad": 1.0}
+
+
+def test_after_an_interrupt_amplifiers_that_keep_power_are_named(stubborn):
+    _, site = stubborn(kept=10)
+    ended = end_of_step(site, interrupted)
+    assert str(ended).startswith("amplifiers at nowhere: expected azimuth disabled")
+    assert str(ended).endswith("press the emergency stop")
+
+
+def test_a_line_out_of_step_after_an_interrupt_is_opened_anew_to_take_the_power(stubborn):
+    bench, site = stubborn(out_of_step=True)
+    assert isinstance(end_of_step(site, interrupted), KeyboardInterrupt)
+    assert bench.opened == 2
+    assert not bench.powered
+
+
+def test_an_interrupt_while_the_motors_lose_power_does_not_end_that_and_is_not_lost(stubborn):
+    bench, site = stubborn(signals=2)
+    assert isinstance(end_of_step(site), KeyboardInterrupt)
+    assert bench.signals == 0
+    assert not bench.powered
+
+
+def test_an_interrupt_while_a_failed_step_takes_the_power_does_not_end_that(stubborn):
+    bench, site = stubborn(signals=1)
+    assert str(end_of_step(site, stops)) == "a stop"
+    assert bench.signals == 0
+    assert not bench.powered

@@ -1,12 +1,14 @@
 """The step `stacks`: what the amplifier's readback says of order, gain, polarity and byte order."""
 
+import signal
+
 import numpy as np
 import pytest
 from commissioning.motor_bench import site_of
 
 from fitctl.commissioning.outcome import StepError
 from fitctl.commissioning.steps import stacks
-from fitctl.commissioning.steps.stacks import STEP_V, check_stacks
+from fitctl.commissioning.steps.stacks import STEP_V, check_stacks, opened
 
 GAIN = 15.0
 
@@ -93,3 +95,38 @@ def test_what_no_key_puts_right_is_named_after_a_small_step_at_most(step, wrong,
     bench, _, text = step(**wrong)
     assert any(one in text for one in named.split("|")), text
     assert bench.furthest_v <= STEP_V * 1.001
+
+
+def end_of_way_back(monkeypatch, ending):
+    """What ends a step that left the stacks 4 V from where they were, with a signal on their way back."""
+    bench = BenchStacks()
+    monkeypatch.setattr(stacks, "dac_of", lambda _settings: bench)
+    monkeypatch.setattr(stacks, "piezo_of", lambda _settings: bench)
+    send_v = bench.send_v
+
+    def interrupt(volts):
+        send_v(volts)
+        monkeypatch.setattr(bench, "send_v", send_v)
+        signal.raise_signal(signal.SIGINT)
+
+    def step(moved):
+        moved.set(bench.began_v + 4.0)
+        monkeypatch.setattr(bench, "send_v", interrupt)
+        if ending is not None:
+            raise ending
+
+    with pytest.raises((StepError, KeyboardInterrupt)) as caught, opened(site_of()) as moved:
+        step(moved)
+    return bench, caught.value
+
+
+def test_an_interrupt_does_not_end_the_way_back_and_is_not_lost(monkeypatch):
+    bench, ended = end_of_way_back(monkeypatch, None)
+    assert isinstance(ended, KeyboardInterrupt)
+    assert bench.held_v == pytest.approx(bench.began_v)
+
+
+def test_an_interrupt_does_not_end_the_way_back_of_a_failed_step(monkeypatch):
+    bench, ended = end_of_way_back(monkeypatch, StepError("a stop"))
+    assert str(ended) == "a stop"
+    assert bench.held_v == pytest.approx(bench.began_v)

@@ -5,9 +5,14 @@ import threading
 import time
 
 import pytest
+from commissioning.motor_bench import site_of
 from scripted_server import scripted_server
 
 from fitctl import config
+from fitctl.clock import MonotonicClock
+from fitctl.commissioning.outcome import StepError
+from fitctl.commissioning.steps import motors
+from fitctl.commissioning.steps.motors import powered
 from fitctl.drivers.ensemble.driver import EnsembleAmplifiers, probe_ensemble
 from fitctl.drivers.ensemble.link import EnsembleLink
 from fitctl.drivers.ensemble.protocol import Reply
@@ -326,6 +331,14 @@ def test_an_axis_that_does_not_come_up_is_an_error_and_both_are_disabled(scripte
     assert "DISABLE @1" in script.heard
 
 
+def test_an_axis_that_keeps_its_power_fails_the_step_of_a_commissioning(scripted, monkeypatch):
+    driver, _ = scripted()  # both axes report that they are enabled, whatever they are commanded
+    monkeypatch.setattr(motors, "amplifiers_of", lambda _siderostat: driver)
+    ends = "azimuth disabled, got not within 0.2 s; .* a motor may still have power"
+    with pytest.raises(StepError, match=ends), powered(site_of(clock=MonotonicClock())):
+        pass
+
+
 def test_asked_only_what_is_no_status_word_is_an_error_too(scripted, settings):
     driver, _ = scripted(answers={"AXISFAULT(@1)": "%1.5\n"})
     with pytest.raises(DeviceProtocolError, match=r"a number in answer to AXISFAULT\(@1\)"):
@@ -434,3 +447,27 @@ def test_asked_only_it_tells_what_disagrees_and_stays_as_it_is(bench_of):
         "axis @1 has no software limits",
         "axis @1 is in fault (amplifier)",
     ]
+
+
+def test_an_interrupt_between_a_command_and_its_answer_takes_the_power_of_both_axes(
+    bench_of, monkeypatch
+):
+    bench = bench_of("ensemble")
+    monkeypatch.setattr(motors, "amplifiers_of", lambda _siderostat: bench.driver)
+    answered = EnsembleLink._reply
+
+    def interrupted(_link, _text, _deadline_s):
+        monkeypatch.setattr(EnsembleLink, "_reply", answered)
+        time.sleep(0.05)  # the answer is here when the next command is sent
+        raise KeyboardInterrupt
+
+    def step():
+        with powered(site_of(clock=MonotonicClock())) as held:
+            held.exchange((5.0, 0.0))
+            assert bench.motors.enabled == [True, True]
+            monkeypatch.setattr(EnsembleLink, "_reply", interrupted)
+            held.exchange((5.0, 0.0))
+
+    with pytest.raises(KeyboardInterrupt):
+        step()
+    assert bench.motors.enabled == [False, False]
