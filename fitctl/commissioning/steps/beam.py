@@ -6,13 +6,14 @@ import itertools
 import math
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.commissioning.outcome import Outcome, Site, StepError
+from fitctl.commissioning.steps.ending import stopped_early
 from fitctl.commissioning.steps.motors import Motors, Servo, powered
 from fitctl.commissioning.steps.plate import ROTATION_APART_DEG, similar
 from fitctl.config import Collector, MetrologyLoop
@@ -225,8 +226,7 @@ def collector_moves(site: Site) -> str:
     collector = _collector(site)
     return (
         "the hexapod: its reference move if it has none, which moves the whole platform; then "
-        f"{MOVE_MM:g} mm along link_azimuth and across it, at "
-        f"{min(_VELOCITY_MM_S, collector.hexapod.velocity_limit_mm_s):g} mm/s, and back"
+        f"{MOVE_MM:g} mm along link_azimuth and across it, at {_velocity_mm_s(collector):g} mm/s, and back"
     )
 
 
@@ -238,13 +238,17 @@ def _collector(site: Site) -> Collector:
     return collector
 
 
+def _velocity_mm_s(collector: Collector) -> float:
+    return min(_VELOCITY_MM_S, collector.hexapod.velocity_limit_mm_s)
+
+
 def check_collector(site: Site) -> Outcome:
     """Which way the beam moves on the photodiodes as the hexapod moves.
 
     Raises
     ------
     StepError
-        If it does not move, or as in a mirror.
+        If it does not move, or as in a mirror, or reports an error. If it may still move, the text says so.
     """
     collector = _collector(site)
     hexapod = HEXAPODS[collector.hexapod.driver](collector.hexapod)
@@ -252,27 +256,36 @@ def check_collector(site: Site) -> Outcome:
         hexapod.open()
         if not hexapod.pose().referenced:
             site.report("the hexapod makes its reference move")
-            hexapod.reference()
-        with watching(site) as watch:
+            with _stopped(hexapod):
+                hexapod.reference()
+        with watching(site) as watch, _stopped(hexapod):
             array = PhotodiodeArray(watch.loop.sensor, watch.loop.acquisition.detection_sigma)
+            velocity_mm_s = _velocity_mm_s(collector)
             axes = transverse_axes(collector.geometry)
-            seen = np.array([_carried(watch, array, hexapod, axis) for axis in axes]).T
+            seen = np.array(
+                [_carried(watch, array, hexapod, axis, velocity_mm_s) for axis in axes]
+            ).T
     except DeviceError as error:
         raise StepError(str(error)) from None
     finally:
-        with suppress(DeviceError):
-            hexapod.stop()
         hexapod.close()
     return _collector_outcome(collector, -seen)
 
 
-def _carried(watch: BeamWatch, array: PhotodiodeArray, hexapod: Hexapod, axis: Floats) -> Floats:
+def _stopped(hexapod: Hexapod) -> AbstractContextManager[None]:
+    danger = "the hexapod may still move: press its emergency stop"
+    return stopped_early(hexapod.stop, hexapod.open, danger)
+
+
+def _carried(
+    watch: BeamWatch, array: PhotodiodeArray, hexapod: Hexapod, axis: Floats, velocity_mm_s: float
+) -> Floats:
     """How far the beam moved on the array, in metres for each metre of the hexapod's along an axis."""
     start = hexapod.pose().pose
     places = []
     for way in (-1.0, 1.0, 0.0):
         x_mm, y_mm, z_mm = np.array(start[:3]) + way * MOVE_MM * axis
-        _go(watch, hexapod, start._replace(x_mm=x_mm, y_mm=y_mm, z_mm=z_mm))
+        _go(watch, hexapod, start._replace(x_mm=x_mm, y_mm=y_mm, z_mm=z_mm), velocity_mm_s)
         beam = array.beam(tuple(watch.volts()))
         if beam.state is not BeamState.MEASURED:
             msg = "the beam is not on all four photodiodes; repeat the step photodiodes"
@@ -281,10 +294,10 @@ def _carried(watch: BeamWatch, array: PhotodiodeArray, hexapod: Hexapod, axis: F
     return np.asarray((places[1] - places[0]) / (2e-3 * MOVE_MM))
 
 
-def _go(watch: BeamWatch, hexapod: Hexapod, pose: Pose) -> None:
+def _go(watch: BeamWatch, hexapod: Hexapod, pose: Pose, velocity_mm_s: float) -> None:
     """Move there and wait, with the motors held."""
-    hexapod.move_to(pose, _VELOCITY_MM_S)
-    until_s = time.monotonic() + 2 * MOVE_MM / _VELOCITY_MM_S + 10.0
+    hexapod.move_to(pose, velocity_mm_s)
+    until_s = time.monotonic() + 2 * MOVE_MM / velocity_mm_s + 10.0
     look_s = time.monotonic() + 0.3
     while True:
         watch.servo.hold()
@@ -292,6 +305,12 @@ def _go(watch: BeamWatch, hexapod: Hexapod, pose: Pose) -> None:
             continue
         look_s = time.monotonic() + 0.1
         reading = hexapod.pose()
+        if reading.error or not reading.servos_on:
+            msg = (
+                f"the hexapod did not get to its pose: {reading.error or 'a servo is off'}; remove the cause, "
+                "reference the hexapod if a servo is off, and repeat the step"
+            )
+            raise StepError(msg)
         if not reading.moving:
             return
         if time.monotonic() > until_s:

@@ -1,6 +1,7 @@
 """What motions of the metrology beam make of the rig file: photodiodes' order, the hexapod's direction."""
 
 import itertools
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,10 +15,12 @@ from fitctl.commissioning.steps import beam, motors
 from fitctl.commissioning.steps.beam import (
     _collector_outcome,
     _photodiodes_outcome,
+    check_collector,
     check_photodiodes,
+    collector_moves,
 )
 from fitctl.config import default_rig_path, load_rig
-from fitctl.drivers.interface import DiodeReading
+from fitctl.drivers.interface import DeviceFault, DiodeReading, HexapodReading, Pose
 from fitctl.model.metrology.geometry import transverse_axes
 from fitctl.model.optics import rotation
 
@@ -135,3 +138,113 @@ def test_without_light_the_step_ends(step):
 def test_a_photodiode_without_light_is_named(step):
     with pytest.raises(StepError, match="AIN3: no light"):
         step((0.01, 0.02), light=(1.0, 1.0, 1.0, 0.0))
+
+
+# ---------------------------------------------------------------- the hexapod
+class BenchHexapod:
+    """A hexapod over motors of a bench. While it moves, it reports `error`, or `interrupts` the step."""
+
+    def __init__(self, now_s, bench, **wrong):
+        self.now_s, self.bench = now_s, bench
+        self.interrupts, self.keeps_moving, self.referenced = False, False, True
+        self.error, self.servos_on = "", True
+        self.velocities_mm_s, self.powered_at_stop = [], []
+        self.at, self.arrives_s = Pose(), 0.0
+        vars(self).update(wrong)
+
+    def open(self):
+        pass
+
+    close = open
+
+    def reference(self):
+        raise KeyboardInterrupt
+
+    def move_to(self, pose, velocity_mm_s):
+        self.velocities_mm_s.append(velocity_mm_s)
+        way_mm = float(np.linalg.norm(np.subtract(pose, self.at)))
+        self.at, self.arrives_s = pose, self.now_s() + way_mm / velocity_mm_s
+
+    def pose(self):
+        moves = self.now_s() < self.arrives_s
+        if moves and self.interrupts:
+            raise KeyboardInterrupt
+        error, servos_on = (self.error, self.servos_on) if moves else ("", True)
+        return HexapodReading(self.now_s(), self.at, moves, self.referenced, servos_on, error)
+
+    def stop(self):
+        self.powered_at_stop.append(self.bench.powered)
+        if self.keeps_moving:
+            raise DeviceFault("hexapod", "nowhere", "all axes at rest", "a platform that moves", "")
+
+
+def rig_with_hexapod_limit(velocity_mm_s):
+    hexapod = RIG.collector.hexapod.model_copy(update={"velocity_limit_mm_s": velocity_mm_s})
+    collector = RIG.collector.model_copy(update={"hexapod": hexapod})
+    return RIG.model_copy(update={"collector": collector})
+
+
+@pytest.fixture
+def carried(monkeypatch):
+    """Runs the step `collector` on a bench; gives the hexapod, and how the step ended."""
+
+    def run(rig=RIG, **wrong):
+        clock, looks = VirtualClock(), itertools.count()
+        now_s = lambda: 0.05 * next(looks)  # noqa: E731
+        bench = BenchAmplifiers(clock)
+        diodes = BeamDiodes(bench, (0.0, 0.0), range(4))
+        hexapod = BenchHexapod(now_s, bench, **wrong)
+        monkeypatch.setattr(motors, "amplifiers_of", lambda _siderostat: bench)
+        monkeypatch.setattr(beam, "PHOTODIODES", {"labjack_t7": lambda _device: diodes})
+        monkeypatch.setattr(beam, "HEXAPODS", {"c887": lambda _device: hexapod})
+        monkeypatch.setattr(beam, "time", SimpleNamespace(monotonic=now_s))
+        with pytest.raises((StepError, KeyboardInterrupt)) as caught:
+            check_collector(site_of(rig, clock, "metrology"))
+        assert not bench.powered
+        return hexapod, caught.value
+
+    return run
+
+
+@pytest.mark.parametrize("limit_mm_s", [0.1, 8.0])
+def test_the_hexapod_moves_no_faster_than_its_limit_and_is_given_the_time(carried, limit_mm_s):
+    rig = rig_with_hexapod_limit(limit_mm_s)
+    hexapod, ended = carried(rig)
+    assert "does not move as it should" in str(ended)  # the beam of this bench stays where it is
+    assert hexapod.velocities_mm_s == [min(1.0, limit_mm_s)] * 6
+    assert f"at {min(1.0, limit_mm_s):g} mm/s" in collector_moves(site_of(rig, name="metrology"))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        ({"error": "error 500, the emergency stop is pressed"}, "the emergency stop is pressed"),
+        ({"servos_on": False}, "a servo is off"),
+    ],
+)
+def test_what_the_hexapod_reports_on_its_way_ends_the_step(carried, wrong, named):
+    hexapod, ended = carried(**wrong)
+    assert named in str(ended)
+    assert len(hexapod.velocities_mm_s) == 1
+
+
+def test_an_interrupt_stops_the_hexapod_before_the_motors_lose_their_power(carried):
+    hexapod, ended = carried(interrupts=True)
+    assert isinstance(ended, KeyboardInterrupt)
+    assert hexapod.powered_at_stop == [True]
+
+
+def test_an_interrupt_stops_a_reference_move(carried):
+    hexapod, ended = carried(referenced=False)
+    assert isinstance(ended, KeyboardInterrupt)
+    assert hexapod.powered_at_stop == [False]
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"interrupts": True}, {"servos_on": False}, {"referenced": False}]
+)
+def test_a_hexapod_that_does_not_stop_is_named_with_its_emergency_stop(carried, wrong):
+    _, ended = carried(keeps_moving=True, **wrong)
+    assert str(ended).endswith(
+        "a platform that moves; the hexapod may still move: press its emergency stop"
+    )

@@ -11,6 +11,7 @@ from instruments.c887_settings import MOCK, device
 from scripted_server import scripted_server
 from serial.urlhandler import protocol_socket
 
+from fitctl.commissioning.steps.ending import stopped_early
 from fitctl.config import Fault
 from fitctl.drivers.c887 import link
 from fitctl.drivers.c887.driver import C887Hexapod, probe_c887
@@ -574,3 +575,23 @@ def test_moves_that_another_client_stops_show_in_the_reading(struck):
     assert "error 10" in driver.pose().error
     time.sleep(0.05)
     assert not driver.pose().moving
+
+
+def test_an_interrupt_between_a_question_and_its_answer_stops_the_move(hexapod, monkeypatch):
+    exchange = link.C887Link._exchange
+
+    def interrupted(line, name, data):
+        monkeypatch.setattr(link.C887Link, "_exchange", exchange)
+        line._write(name, data)
+        time.sleep(0.05)  # the answer is here when the next question is sent
+        raise KeyboardInterrupt
+
+    def step():
+        with stopped_early(hexapod.stop, hexapod.open, "it may still move"):
+            hexapod.move_to(Pose(x_mm=40.0), 8.0)
+            monkeypatch.setattr(link.C887Link, "_exchange", interrupted)
+            hexapod.pose()
+
+    with pytest.raises(KeyboardInterrupt):
+        step()
+    assert not hexapod.pose().moving
