@@ -97,10 +97,11 @@ def test_revoking_refuses_commands_and_cuts_telemetry_of_who_is_connected(served
 
 
 def test_a_key_that_is_unknown_is_told_that_it_is(served):
-    stranger = served.person("stranger")
+    key = served.key("stranger")
     revoke_key(served.rig, "stranger")
     until(lambda: not any(k.name == "stranger" for k in served.gateway._keyed.allowed.values()))
 
+    stranger = served.client_of(key)
     with pytest.raises(ConnectionError, match="does not let the key stranger in"):
         stranger.send(Status(), timeout_s=0.5)
     assert stranger.receive(0.2) is None
