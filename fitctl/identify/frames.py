@@ -172,7 +172,7 @@ def longest_rest(ticks: dict[str, NDArray[Any]]) -> tuple[float, float]:
     IdentifyError
         If the stages never stood still with frames coming.
     """
-    is_linked = bool(np.isfinite(ticks["link_az_rad"]).any())
+    is_linked = bool(np.isfinite(ticks.get("link_az_rad", np.nan)).any())  # logs of 0.1.0 lack it
     names = (*_STACKS, "mode_number") if is_linked else (*_STACKS, *_SETPOINTS)
     commands = np.column_stack([ticks[name] for name in names])
     moved = np.flatnonzero(np.any(np.diff(commands, axis=0) != 0, axis=1)) + 1

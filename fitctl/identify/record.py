@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from fitctl.identify.errors import IdentifyError
 from fitctl.logging.reading import Columns, read_records
-from fitctl.logging.records import ExperimentStart, InjectionRecord, Tick
-from fitctl.logging.schemas import TOPICS
+from fitctl.logging.records import AnyRecord, ExperimentStart, InjectionRecord, Tick
+from fitctl.logging.schemas import TOPICS, fields_of
 
 Floats = NDArray[np.float64]
 _TICK_FIELDS = tuple(field.name for field in msgspec.structs.fields(Tick))
@@ -61,7 +61,7 @@ class ExperimentRecord:
 
 
 def tick_columns(ticks: Iterable[Any]) -> Columns:
-    """Ticks, structs or a log's messages, in the form of :func:`fitctl.logging.reading.tick_arrays`."""
+    """Ticks in the form of :func:`fitctl.logging.reading.tick_arrays`."""
     rows = zip(*map(attrgetter(*_TICK_FIELDS), ticks), strict=True)
     return {name: np.array(column) for name, column in zip(_TICK_FIELDS, rows, strict=True)}
 
@@ -72,7 +72,7 @@ def axis_pair(columns: Mapping[str, NDArray[Any]], name: str) -> Floats:
 
 
 def gather(records: Iterable[Any], loop: str, name: str) -> ExperimentRecord:
-    """The last experiment of a name, finished or not, among records: structs, or a log's messages.
+    """The last experiment of a name, finished or not, among records.
 
     Raises
     ------
@@ -124,9 +124,33 @@ def gather_log(path: Path, loop: str, name: str) -> ExperimentRecord:
     Raises
     ------
     IdentifyError
-        If there is none, or it cannot be.
+        If there is none, it cannot be, or a record is not as fitctl records it.
     LogError
         If the log cannot be read.
     """
-    topics = [TOPICS[kind].format(loop=loop) for kind in (Tick, ExperimentStart, InjectionRecord)]
-    return gather((entry.message for entry in read_records(path, topics)), loop, name)
+    return gather(loop_records(path, loop, Tick, ExperimentStart, InjectionRecord), loop, name)
+
+
+def loop_records(path: Path, loop: str, *kinds: type[AnyRecord]) -> Iterator[AnyRecord]:
+    """Records of some kinds in a log, as structs; a field that logs of earlier versions lack has its default.
+
+    Raises
+    ------
+    IdentifyError
+        If a record lacks a field without a default, or has a value of another kind.
+    LogError
+        If the log cannot be read.
+    """
+    by_topic = {TOPICS[kind].format(loop=loop): kind for kind in kinds}
+    for entry in read_records(path, list(by_topic)):
+        kind = by_topic[entry.topic]
+        values = fields_of(kind, entry.message) | {"type": kind.__name__}
+        try:
+            record = msgspec.convert(values, kind)
+        except msgspec.ValidationError as error:
+            msg = (
+                f"a record of {entry.topic} is not as fitctl records it: {error}; name a log that fitctl "
+                "recorded"
+            )
+            raise IdentifyError(msg) from None
+        yield record

@@ -148,6 +148,13 @@ def test_the_longest_rest_begins_after_the_stages_have_settled():
     assert end_s == pytest.approx(100 + 7.98)
 
 
+def test_ticks_of_0_1_0_without_a_link_have_a_rest_too():
+    ticks = tick_columns(still_from(100, 400))
+    whole = longest_rest(ticks)
+    del ticks["link_az_rad"], ticks["link_el_rad"]
+    assert longest_rest(ticks) == whole
+
+
 def test_over_a_link_the_siderostat_may_move_in_open_loop():
     """From tick 100 to 300 the loop is open; before and after, the mirror stands still in a search."""
     modes = [Mode.EXPERIMENT if 100 <= k < 300 else Mode.ACQUISITION for k in range(500)]

@@ -11,17 +11,15 @@ import msgspec
 import numpy as np
 
 from fitctl.identify.errors import IdentifyError
-from fitctl.logging.reading import Columns, read_records
+from fitctl.identify.record import loop_records
+from fitctl.logging.reading import Columns
 from fitctl.logging.records import MetrologyTick, SequenceAttempt, Tick
-from fitctl.logging.schemas import TOPICS
 
 TickKind = type[Tick] | type[MetrologyTick]
 
 
 def gather_step(records: Iterable[Any], kind: TickKind, loop: str, step: str) -> Columns:
     """Fields of a loop's ticks during the last attempt at a step that was done, each of shape (ticks,).
-
-    Records are structs or a log's messages.
 
     Raises
     ------
@@ -55,9 +53,8 @@ def gather_step_log(path: Path, kind: TickKind, loop: str, step: str) -> Columns
     Raises
     ------
     IdentifyError
-        As :func:`gather_step`.
+        As :func:`gather_step`, or if a record is not as fitctl records it.
     LogError
         If the log cannot be read.
     """
-    topics = [TOPICS[kind].format(loop=loop), TOPICS[SequenceAttempt]]
-    return gather_step((entry.message for entry in read_records(path, topics)), kind, loop, step)
+    return gather_step(loop_records(path, loop, kind, SequenceAttempt), kind, loop, step)
