@@ -1,5 +1,7 @@
 import dataclasses
+import io
 import os
+import zipfile
 
 import numpy as np
 import pytest
@@ -214,6 +216,87 @@ def test_a_file_that_is_no_bench_record_is_refused(rig, tmp_path, content):
     path = tmp_path / "bench.npz"
     path.write_bytes(content)
     with pytest.raises(IdentifyError, match="not a bench record"):
+        response.read_bench(path, rig.loops["right"].fsm)
+
+
+SAMPLE_COLUMNS = ("time_s", "drive_v", "detector_az_v", "detector_el_v")
+
+
+def npz(path, **zip_options):
+    """A bench record as numpy writes it, or as a ZIP of another make."""
+    with zipfile.ZipFile(path, "w", **zip_options) as archive:
+        for name in SAMPLE_COLUMNS:
+            column = io.BytesIO()
+            np.save(column, np.arange(1000.0))
+            archive.writestr(f"{name}.npy", column.getvalue())
+
+
+def with_a_flipped_byte(path):
+    npz(path, compression=zipfile.ZIP_DEFLATED)
+    content = bytearray(path.read_bytes())
+    content[60] ^= 0xFF
+    path.write_bytes(content)
+
+
+def encrypted(path):
+    npz(path)
+    content = path.read_bytes().replace(
+        b"PK\x01\x02\x14\x03\x14\x00\x00", b"PK\x01\x02\x14\x03\x14\x00\x01"
+    )
+    path.write_bytes(content)
+
+
+def of_another_method(path):
+    npz(path, compression=zipfile.ZIP_BZIP2)
+
+
+def of_one_array(path):
+    with path.open("wb") as file:
+        np.save(file, np.arange(1000.0))
+
+
+@pytest.mark.parametrize(
+    ("write", "why"),
+    [
+        (with_a_flipped_byte, "error:? "),
+        (encrypted, "is encrypted"),
+        (of_another_method, "is packed as"),
+        (of_one_array, "not a zip file"),
+    ],
+)
+def test_a_damaged_or_odd_archive_is_refused_in_one_line(rig, tmp_path, write, why):
+    path = tmp_path / "bench.npz"
+    write(path)
+    with pytest.raises(IdentifyError, match=rf"not a bench record \(.*{why}") as raised:
+        response.read_bench(path, rig.loops["right"].fsm)
+    assert "\n" not in str(raised.value)
+
+
+def forged(path, shape, dtype="<f8"):
+    """A record whose columns promise more than they have."""
+    with zipfile.ZipFile(path, "w") as archive:
+        for name in SAMPLE_COLUMNS:
+            column = io.BytesIO()
+            header = {"descr": dtype, "fortran_order": False, "shape": shape}
+            np.lib.format.write_array_header_1_0(column, header)
+            archive.writestr(f"{name}.npy", column.getvalue() + bytes(8000))
+
+
+@pytest.mark.parametrize(
+    ("shape", "dtype"), [((10**15,), "<f8"), ((10**9,), "<f8"), ((10**12,), "|S0"), ((-1,), "<f8")]
+)
+def test_a_header_that_promises_more_than_there_is_needs_no_memory(rig, tmp_path, shape, dtype):
+    path = tmp_path / "bench.npz"
+    forged(path, shape, dtype)
+    with pytest.raises(IdentifyError, match="not a bench record"):
+        response.read_bench(path, rig.loops["right"].fsm)
+
+
+def test_a_small_file_that_unpacks_to_gigabytes_is_refused(rig, tmp_path):
+    path = tmp_path / "bench.npz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("time_s.npy", bytes(300 << 20))
+    with pytest.raises(IdentifyError, match="314572800 bytes once unpacked; expected at most"):
         response.read_bench(path, rig.loops["right"].fsm)
 
 
