@@ -6,6 +6,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from fitctl.config import Rig, lay_over, rig_from_document
+from fitctl.config.addresses import BAUD_RATES
+
+_FLIGHT_WRITES = 2  # 1 ms apart, which is the least that a rig file may have
 
 
 def changed(rig: Rig, fragment: Mapping[str, Any]) -> Rig:
@@ -38,6 +41,21 @@ def with_rougher_stages(rig: Rig, loop_name: str, hysteresis: float, backlash_ti
 
 
 def at_flight_rate(rig: Rig) -> Rig:
-    """500 Hz with a delay of 1.75 frames as in the laboratory, and as much light in each frame."""
+    """500 Hz with a delay of 1.75 frames as in the laboratory, and as much light in each frame.
+
+    The D/A of the laboratory may be too slow for that: here, it is written as often as a frame leaves time for,
+    and a serial line is as fast as any.
+    """
     camera = {"frame_rate_hz": 500.0, "exposure_s": 0.001, "frame_delay_s": 0.0035}
-    return changed(rig, {"camera": camera})
+    loops = {
+        name: {
+            "fsm": {
+                "dac": {
+                    "writes_per_frame": min(loop.fsm.dac.writes_per_frame, _FLIGHT_WRITES),
+                    "baud_rate": max(BAUD_RATES),
+                }
+            }
+        }
+        for name, loop in rig.stellar_loops.items()
+    }
+    return changed(rig, {"camera": camera, "loops": loops})

@@ -110,6 +110,23 @@ def test_the_flight_rate_keeps_the_delay_in_frames(rig):
     )
 
 
+@pytest.mark.parametrize(("writes", "at_flight_rate_writes"), [(1, 1), (2, 2), (3, 2), (10, 2)])
+def test_a_d_a_that_is_written_often_is_written_less_often_at_the_flight_rate(
+    rig, writes, at_flight_rate_writes
+):
+    often = {"loops": {"right": {"fsm": {"dac": {"writes_per_frame": writes}}}}}
+    flight = at_flight_rate(changed(rig, often))
+
+    assert flight.loops["right"].fsm.dac.writes_per_frame == at_flight_rate_writes
+
+
+def test_a_serial_line_to_the_d_a_does_not_limit_the_flight_rate(rig):
+    line = {"transport": "rtu", "serial_port": "/dev/ttyUSB7", "baud_rate": 115_200}
+    serial = changed(rig, {"loops": {"right": {"fsm": {"dac": line}}}})
+
+    assert at_flight_rate(serial).camera.frame_rate_hz == 500.0
+
+
 def test_a_run_too_short_for_a_spectrum_is_refused(rig):
     with pytest.raises(IdentifyError, match="no frame in VERNIER; record"):
         logged_spectra(rig, "right", 0, 2.0)
