@@ -262,7 +262,7 @@ def _lowest(motion: _Motion, near_s: float) -> tuple[float, float, float]:
 
     Voltages are held, so the misfit goes in small steps; a parabola over one hold sees past them.
     """
-    half_s = max(motion.hold_s / 2, 10 * _FINE_STEP_S)
+    half_s = float(np.clip(motion.hold_s / 2, 10 * _FINE_STEP_S, _WIDEST_SHIFT_S))
     shifts_s = np.arange(-half_s, half_s + _FINE_STEP_S / 2, _FINE_STEP_S)
     for _ in range(2):  # about the coarse search's lowest, and then about the lowest itself
         misfits = motion.misfits(near_s + shifts_s)

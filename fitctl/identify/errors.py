@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import NDArray
+
 from fitctl.config import Rig
 
 _LEAST_SEEN = 0.9  # of the frames
+_LONGEST_S = 86_400.0  # of an experiment or a step, with all that interrupts it
 
 
 class IdentifyError(ValueError):
@@ -41,3 +45,25 @@ def require_star(with_star: int, due: int, frames: str, least: int) -> None:
             f"{100 * _LEAST_SEEN:g} %; look at the flux, then run it again"
         )
         raise IdentifyError(msg)
+
+
+def require_times(times_s: NDArray[np.float64], period_s: float, what: str) -> None:
+    """Refuse times, shape (n,), that cannot be of one experiment with a frame in each period or less often.
+
+    Within a period, they may go back by what is the clocks' noise.
+
+    Raises
+    ------
+    IdentifyError
+    """
+    steps_s = np.diff(times_s)
+    span_s = np.ptp(times_s)
+    # NaN fulfils none of these.
+    if span_s <= _LONGEST_S and steps_s.min() > -period_s and np.median(steps_s) > period_s / 2:
+        return
+    msg = (
+        f"the times of the {what} go on by {np.median(steps_s):.4g} s in the median and {steps_s.min():.4g} s "
+        f"at the least, over {span_s:.4g} s; expected one every {period_s:.4g} s, none before the one before "
+        "it, and no more than a day; name the rig and the whole log of one run"
+    )
+    raise IdentifyError(msg)

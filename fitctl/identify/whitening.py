@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from fitctl.config import Rig
 from fitctl.controllers.centroid import sensor_noise_px
+from fitctl.identify.errors import require_times
 from fitctl.model import air_path
 
 Floats = NDArray[np.float64]
@@ -42,9 +43,15 @@ def whitener(
     -------
     callable
         From columns, shape (frames, m) in px, to as many whitened ones.
+
+    Raises
+    ------
+    IdentifyError
+        If the times cannot be of one run.
     """
     settings = rig.stellar_loops[loop_name]
     period_s = rig.camera.period_s
+    require_times(mid_exposure_s, period_s, f"frames of loop {loop_name}")
     sensor_px = sensor_noise_px(rig.camera, settings, settings.star_flux_dn)
     noise_px = max(sensor_px, least_noise_px)
     air = settings.vernier.air_path
@@ -83,8 +90,11 @@ def whitener(
 
 
 def _repeated(transition: Floats, noise: Floats, times: int) -> tuple[Floats, Floats]:
-    """Some steps as one: discretized as a whole, a gap of seconds has lost all digits of its noise."""
-    through, added = transition, noise
-    for _ in range(times - 1):
-        through, added = transition @ through, transition @ added @ transition.T + noise
+    """Some steps as one, by squaring: discretized as a whole, a gap of seconds loses all digits of noise."""
+    through, added = np.eye(len(transition)), np.zeros_like(noise)
+    while times:
+        if times % 2:
+            through, added = transition @ through, transition @ added @ transition.T + noise
+        transition, noise = transition @ transition, transition @ noise @ transition.T + noise
+        times //= 2
     return through, added

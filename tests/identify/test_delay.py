@@ -164,3 +164,15 @@ def test_the_plot_is_drawn(result, tmp_path):
     result.plot(tmp_path / "delay.png")
     assert (tmp_path / "delay.png").stat().st_size > 1000
     assert any("ms" in line for line in result.lines())
+
+
+@pytest.mark.timeout(60)
+def test_voltages_that_come_hours_apart_are_refused(rig, record):
+    rows = np.arange(0, len(record.injected_s), 500)
+    rare = dataclasses.replace(
+        record,
+        injected_s=record.injected_s[0] + 1e6 * np.arange(len(rows)),
+        injected_v=record.injected_v[rows],
+    )
+    with pytest.raises(IdentifyError, match=r"expected|no time shift"):
+        delay.analyse(rig, rare)

@@ -3,6 +3,7 @@ import pytest
 from plant_records import record_of
 
 from fitctl.config import default_rig_path, load_rig
+from fitctl.identify.errors import IdentifyError
 from fitctl.identify.whitening import LEAST_NOISE_PX, whitener
 from fitctl.model.image.light import centroid_noise_px
 
@@ -46,6 +47,31 @@ def test_a_gap_of_any_length_makes_it_no_less_white(rig, gap_s):
     kept = (times_s < times_s[0] + 5.0) | (times_s > times_s[0] + 5.0 + gap_s)
     white = whitener(rig, "right", times_s[kept])(record.star_px[kept])[1:]
     assert np.std(white) == pytest.approx(1.0, rel=0.1)
+
+
+@pytest.mark.timeout(20)
+def test_hours_between_two_frames_cost_no_time(rig):
+    period_s = rig.camera.period_s
+    times_s = np.arange(600) * period_s + np.repeat([0.0, 80_000.0], 300)
+    white = whitener(rig, "right", times_s)(np.ones((600, 1)))
+    assert np.isfinite(white).all()
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda times_s: np.append(times_s, 1e12),
+        lambda times_s: np.append(times_s, 1e300),
+        lambda times_s: np.append(times_s, times_s[-1] - 1.0),
+        lambda times_s: times_s / 1e6,
+        lambda times_s: np.append(times_s, np.nan),
+    ],
+)
+def test_times_that_cannot_be_of_one_experiment_are_refused(rig, change):
+    times_s = np.arange(200) * rig.camera.period_s
+    with pytest.raises(IdentifyError, match="the times of the frames of loop right"):
+        whitener(rig, "right", change(times_s))
 
 
 def test_where_the_star_stands_does_not_matter(rig):

@@ -118,9 +118,9 @@ def analyse(rig: Rig, loop_name: str, ticks: Columns) -> AmbientResult:
     sd_v = sd_v * float(student.ppf(0.975, _BLOCKS - 1)) / 1.96
     noise_v = float(np.sqrt(np.mean(np.var(volts, axis=0, ddof=1))))
     change_v = float(np.abs(ambient_v - loop.sensor.ambient_v).max())
-    if (
-        noise_v > _MOST_NOISE * loop.sensor.noise_v
-        or change_v > _MOST_CHANGE * loop.sensor.on_axis_v
+    if not (  # NaN is not
+        noise_v <= _MOST_NOISE * loop.sensor.noise_v
+        and change_v <= _MOST_CHANGE * loop.sensor.on_axis_v
     ):
         msg = (
             f"ambient: {1e3 * noise_v:.2f} mV RMS of noise and up to {1e3 * change_v:.1f} mV from the rig "

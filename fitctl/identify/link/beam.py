@@ -14,16 +14,18 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import matmul_toeplitz
 from scipy.optimize import least_squares
 
 from fitctl.config import ARCSEC_PER_RAD, AirPathModel, MetrologyLoop, Rig
 from fitctl.identify.backlash import behind_play
 from fitctl.identify.drawing import new_figure
-from fitctl.identify.errors import IdentifyError
-from fitctl.identify.link.ambient import DIODES
+from fitctl.identify.errors import IdentifyError, require_times
+from fitctl.identify.link.ambient import DIODES, SIDES
 from fitctl.identify.record import axis_pair
 from fitctl.identify.slow_mean import correlation
 from fitctl.logging.reading import Columns
+from fitctl.logging.records import MOST
 from fitctl.model.metrology.photodiodes import diode_volts
 from fitctl.model.optics import rotation
 
@@ -35,7 +37,12 @@ _LEAST_SWING_M = 0.5  # of the beam's radius, along each axis
 _MOST_EXCESS = 5.0
 _WIDEST_SHIFT_S = 0.05
 _BIN_S = 0.25  # the air hardly moves meanwhile
-_SIDES = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+_USED = (
+    *("time_s", "sampled_s", "encoder_read_s"),
+    *(f"{name}_{axis}_rad" for name in ("siderostat", "encoder") for axis in ("az", "el")),
+    *(f"diode_{side}_v" for side in SIDES),
+)
+_DIODE_PLACES = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
 
 
 class Found(NamedTuple):
@@ -173,18 +180,17 @@ class _Scan:
     def __init__(self, rig: Rig, loop_name: str, ticks: Columns) -> None:
         loop = rig.metrology_loops[loop_name]
         sensor = loop.sensor
-        usable = np.isfinite(ticks["sampled_s"]) & (ticks["mode"] == "STANDBY")
+        usable = np.all([np.abs(ticks[name]) < MOST for name in _USED], axis=0)  # NaN is not
+        usable &= ticks["mode"] == "STANDBY"
         ticks = {name: column[usable] for name, column in ticks.items()}
-        self.volts = np.stack(
-            [ticks[f"diode_{side}_v"] for side in ("az_plus", "az_minus", "el_plus", "el_minus")],
-            axis=-1,
-        )
+        self.volts = np.stack([ticks[f"diode_{side}_v"] for side in SIDES], axis=-1)
         if len(self.volts) < _LEAST_SAMPLES:
             msg = (
                 f"the photodiodes gave {len(self.volts)} samples during the scan, expected at least "
                 f"{_LEAST_SAMPLES}; run the step {STEP} with more cycles"
             )
             raise IdentifyError(msg)
+        require_times(ticks["sampled_s"], rig.camera.period_s, "samples")
         self.sensor = sensor
         self.sampled_s = ticks["sampled_s"]
         self.delays_s = ticks["time_s"] - self.sampled_s
@@ -241,7 +247,7 @@ class _Scan:
     def volts_per_mm(self, found: Found) -> Floats:
         """How the photodiodes answer to a motion of the beam, shape (samples, 4, 2)."""
         light_v = self.modelled_v(found) - np.array(found[-4:])
-        diodes_mm = 1e3 * self.sensor.diode_offset_m * _SIDES
+        diodes_mm = 1e3 * self.sensor.diode_offset_m * _DIODE_PLACES
         away_mm = self.place_mm(found)[:, None, :] - diodes_mm
         return np.where(
             self.counts[..., None],
@@ -282,7 +288,8 @@ def analyse(rig: Rig, loop_name: str, ticks: Columns, kind: type[Kind]) -> Kind:
     Raises
     ------
     IdentifyError
-        If the loop is no metrology loop, the beam did not move enough, or the fit leaves too much unexplained.
+        If the loop is no metrology loop, the times cannot be of one run, the beam did not move enough or was
+        not on the photodiodes, or the fit leaves too much unexplained.
     """
     loop = rig.metrology_loops.get(loop_name)
     if loop is None:
@@ -305,7 +312,7 @@ def analyse(rig: Rig, loop_name: str, ticks: Columns, kind: type[Kind]) -> Kind:
     covariance, excess, air_mm = _uncertainty(
         scan, found, left_v, fit.jac.reshape(*left_v.shape, -1), _air_of(rig)
     )
-    if excess > _MOST_EXCESS or abs(found.late_ms) > 1e3 * _WIDEST_SHIFT_S:
+    if not (excess <= _MOST_EXCESS and abs(found.late_ms) <= 1e3 * _WIDEST_SHIFT_S):
         msg = (
             f"the model leaves {excess:.1f} times the noise unexplained, with samples {found.late_ms:+.1f} ms "
             f"from their time stamps; expected at most {_MOST_EXCESS:g} times and {1e3 * _WIDEST_SHIFT_S:g} "
@@ -358,6 +365,13 @@ def _uncertainty(
     # Where the beam must have been for each sample's volts, beside the model.
     normal = np.einsum("ndi,ndj->nij", answer, answer)
     clear = np.linalg.eigvalsh(normal)[:, 0] > (noise_v / 1e-3) ** 2 * 1e-4
+    if not clear.any():
+        msg = (
+            f"the light is too weak to show where the beam is: the fit finds {1e3 * found.on_axis_v:.3g} mV on "
+            f"the centre, with {1e3 * noise_v:.3g} mV of noise in a sample; expected the beam on the "
+            f"photodiodes; look at the laser, then run the step {STEP} again"
+        )
+        raise IdentifyError(msg)
     beside_mm = np.linalg.solve(
         normal[clear], np.einsum("ndi,nd->ni", answer[clear], left_v[clear])[..., None]
     )[..., 0]
@@ -371,12 +385,11 @@ def _uncertainty(
     # What the samples do not show, such as a play's start that the first motion took up, has no part in it.
     inverse = np.linalg.pinv(np.einsum("ndp,ndq->pq", jacobian, jacobian), hermitian=True)
     score = np.einsum("ndp,ndi->npi", jacobian, answer)
-    bins = ((scan.sampled_s - scan.sampled_s[0]) / _BIN_S).astype(int)
-    binned = np.zeros((bins[-1] + 1, *score.shape[1:]))
+    bins = ((scan.sampled_s - scan.sampled_s.min()) / _BIN_S).astype(int)
+    binned = np.zeros((bins.max() + 1, *score.shape[1:]))
     np.add.at(binned, bins, score)
-    lag_s = _BIN_S * np.abs(np.subtract.outer(np.arange(len(binned)), np.arange(len(binned))))
-    slow = air_mm2 * np.einsum(
-        "mpi,mn,nqi->pq", binned, correlation(lag_s, air), binned, optimize=True
-    )
+    correlations = correlation(_BIN_S * np.arange(len(binned), dtype=np.float64), air)
+    spread = matmul_toeplitz(correlations, binned.reshape(len(binned), -1)).reshape(binned.shape)
+    slow = air_mm2 * np.einsum("mpi,mqi->pq", binned, spread)
     white = (noise_v * max(1.0, excess)) ** 2 * np.einsum("ndp,ndq->pq", jacobian, jacobian)
     return inverse @ (slow + white) @ inverse, excess, float(np.sqrt(air_mm2))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from fitctl.config import Fsm, Rig
 from fitctl.identify.backlash import behind_play
 from fitctl.identify.drawing import new_figure
-from fitctl.identify.errors import IdentifyError, require_star
+from fitctl.identify.errors import IdentifyError, require_star, require_times
 from fitctl.identify.record import axis_pair
 from fitctl.identify.whitening import whitener
 from fitctl.logging.reading import Columns
@@ -133,8 +133,8 @@ def analyse(rig: Rig, loop_name: str, ticks: Columns) -> FeedforwardResult:
     Raises
     ------
     IdentifyError
-        If the loop has no link, the star was lost, the link's siderostat did not swing along both axes, or the
-        fit leaves too much unexplained.
+        If the loop has no link, the star was lost, the link's siderostat did not swing along both axes, the
+        times cannot be of one run, or the fit leaves too much unexplained.
     """
     loop = rig.stellar_loops.get(loop_name)
     if loop is None or loop.link is None:
@@ -156,6 +156,7 @@ def analyse(rig: Rig, loop_name: str, ticks: Columns) -> FeedforwardResult:
     times_s, link_px, own_px, unturned_px = (
         column[usable] for column in (times_s, link_px, own_px, unturned_px)
     )
+    require_times(times_s, rig.camera.period_s, f"frames of loop {loop_name}")
     swing_arcsec = np.ptp(link_px, axis=0) * scale.sky_arcsec_per_px
     if not swing_arcsec.min() >= _LEAST_SWING_ARCSEC:
         az, el = swing_arcsec.tolist()
@@ -274,15 +275,27 @@ def _direction(times_s: Floats, link_px: Floats) -> Floats:
     """Which way each axis of the link's siderostat moves, shape (frames, 2): -1, 1, or 0 where it rests.
 
     NaN where it turns back: the plays may then not be taken up.
+
+    Raises
+    ------
+    IdentifyError
+        If an axis does not swing.
     """
     half = max(1, round(_SMOOTH_S / 2 / float(np.median(np.diff(times_s)))))
     kernel = np.ones(2 * half + 1) / (2 * half + 1)
     directions = []
-    for axis in range(2):
+    for axis, name in enumerate(AXES):
         padded = np.pad(link_px[:, axis], half, mode="edge")
         rate = np.gradient(np.convolve(padded, kernel, mode="valid"), times_s)
         fast = _MOVES * np.quantile(np.abs(rate), 0.95)
         swings = _swings(times_s, np.abs(rate) > fast, link_px[:, axis])
+        if not swings.any():
+            msg = (
+                f"feedforward: the link's beam moves in {name} only by short jerks; expected a motion over at "
+                f"least {_FAR:.0%} of its whole swing without a stop; see that the link's loop follows the "
+                f"collector, then run the step {STEP} again"
+            )
+            raise IdentifyError(msg)
         moved = np.where(np.abs(rate) > fast, np.sign(rate), np.nan)
         directions.append(np.where(swings, moved, 0.0))
     return np.stack(directions, axis=-1)

@@ -60,3 +60,10 @@ def test_what_is_not_ambient_light_is_refused():
     few = {name: column[:50] for name, column in samples(1).items()}
     with pytest.raises(IdentifyError, match="expected at least 100"):
         ambient.analyse(RIG, "metrology", few)
+
+
+def test_voltages_that_are_no_numbers_are_refused():
+    broken = samples(1)
+    broken["diode_el_plus_v"][1] = np.nan
+    with pytest.raises(IdentifyError, match="is the laser blocked"):
+        ambient.analyse(RIG, "metrology", broken)

@@ -1,6 +1,7 @@
 """The photodiodes' scale and the link's delay from a scan of the beam: against the truth, over seeds."""
 
 import functools
+import resource
 
 import numpy as np
 import pytest
@@ -168,3 +169,41 @@ def test_what_shows_nothing_is_refused():
     )
     with pytest.raises(IdentifyError, match="times the noise unexplained"):
         beam.analyse(RIG, "metrology", shaken, beam.PhotodiodesResult)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("kind", "seed", "on_axis_v"),
+    [(beam.PhotodiodesResult, 1, 0.0), (beam.LinkDelayResult, 0, 0.01)],
+)
+def test_photodiodes_with_hardly_any_light_give_nothing(kind, seed, on_axis_v):
+    with pytest.raises(IdentifyError, match="the light is too weak to show where the beam is"):
+        beam.analyse(RIG, "metrology", scan(seed, on_axis_v=on_axis_v), kind)
+
+
+@pytest.mark.parametrize("time_s", [1e12, 1e5, 0.0])
+def test_a_sample_at_an_impossible_time_is_refused(time_s):
+    ticks = scan(1)
+    ticks["sampled_s"][-1] = time_s
+    with pytest.raises(IdentifyError, match="the times of the samples"):
+        beam.analyse(RIG, "metrology", ticks, beam.LinkDelayResult)
+
+
+@pytest.mark.long
+def test_a_pause_of_hours_needs_no_memory_for_each_pair_of_its_moments():
+    ticks = scan(1)
+    for name in ("time_s", "sampled_s", "encoder_read_s"):
+        ticks[name][-20:] += 40_000.0
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    beam.analyse(RIG, "metrology", ticks, beam.LinkDelayResult)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 1 << 20  # KiB
+
+
+@pytest.mark.long
+def test_samples_that_are_no_numbers_do_not_count():
+    ticks = scan(1)
+    ticks["encoder_az_rad"][40] = np.nan
+    ticks["diode_az_plus_v"][50] = 1e300
+    found = beam.analyse(RIG, "metrology", ticks, beam.LinkDelayResult)
+    assert abs(found.delay_s - DELAY_S) < 3 * found.delay_sd_s
+    assert len(found.volts) == len(ticks["mode"]) - 2

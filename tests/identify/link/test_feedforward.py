@@ -193,6 +193,23 @@ def test_what_shows_nothing_is_refused():
         feedforward.analyse(RIG, "left", shaken)
 
 
+def test_a_link_that_moves_in_jerks_is_refused():
+    jerky = scan(1)
+    stairs = np.abs(np.arange(len(jerky["mode"])) // 50 % 10 - 5)  # a fifth of the way each second
+    jerky["link_az_rad"] = np.ptp(jerky["link_az_rad"]) * stairs / 5
+    with pytest.raises(IdentifyError, match="moves in az only by short jerks"):
+        feedforward.analyse(RIG, "left", jerky)
+
+
+@pytest.mark.parametrize("change", [lambda t: t / 1e9, lambda t: t * 0.0, lambda t: t * 1e9])
+def test_times_that_cannot_be_of_one_scan_are_refused(change):
+    ticks = scan(1)
+    for name in ("mid_exposure_s", "fsm_written_s"):
+        ticks[name] = change(ticks[name])
+    with pytest.raises(IdentifyError, match="the times of the frames of loop left"):
+        feedforward.analyse(RIG, "left", ticks)
+
+
 def test_a_loop_without_the_mirror_s_hysteresis_uses_the_commanded_angles():
     linear = RIG.model_copy(
         update={
