@@ -457,8 +457,14 @@ def predicted(theory: LoopTheory, frequency_hz: Floats) -> Floats:
 def pieces_of(at_s: Floats, usable: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
     """Rows of usable ticks, in pieces of which none lacks anything for longer than `LONGEST_GAP_S`."""
     rows = np.flatnonzero(usable)
-    pieces = np.split(rows, np.flatnonzero(np.diff(at_s[rows]) > LONGEST_GAP_S) + 1)
+    pieces = np.split(rows, np.flatnonzero(ends_piece(at_s[rows])) + 1)
     return [piece for piece in pieces if len(piece) > 1]
+
+
+def ends_piece(at_s: Floats) -> NDArray[np.bool_]:
+    """Whether a piece ends between each time and the next: frames are missing for long, or times go back."""
+    step_s = np.diff(at_s)
+    return (step_s > LONGEST_GAP_S) | (step_s < 0)
 
 
 def _after_dark(

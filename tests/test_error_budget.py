@@ -13,6 +13,7 @@ from fitctl.error_budget import (
     Motion,
     budget,
     motion,
+    pieces_of,
     predicted,
     spectra,
     theory_from_plain,
@@ -267,3 +268,9 @@ def test_a_spectrum_adds_up_to_the_mean_square():
     sums_px2 = density.error.sum(axis=0) * density.frequency_hz[0]
     assert sums_px2 == pytest.approx(np.mean(noise_px**2, axis=0), rel=0.03)
     assert density.frequency_hz[0] == pytest.approx(0.125)
+
+
+@pytest.mark.parametrize("jump_s", [0.6, -0.01, -1e9])
+def test_a_piece_ends_where_frames_are_missing_or_times_go_back(jump_s):
+    at_s = np.append(0.02 * np.arange(5), 0.08 + jump_s + 0.02 * np.arange(3))
+    assert [rows.tolist() for rows in pieces_of(at_s, np.ones(8, bool))] == [[*range(5)], [5, 6, 7]]

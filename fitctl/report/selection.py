@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.error_budget import LONGEST_GAP_S
+from fitctl.error_budget import LONGEST_GAP_S, ends_piece
 from fitctl.identify.record import axis_pair
 from fitctl.logging.reading import Columns
 from fitctl.messages.modes import BEAM_FOLLOWING, FOLLOWING, Mode
@@ -100,9 +100,7 @@ def _select(
     counts = (since_s >= SETTLE_S) & (still_s >= TARGET_SETTLE_S)
     used = rows[counts & measured[rows]]
     at_s = measured_at_s[used]
-    apart = (np.diff(at_s) > LONGEST_GAP_S) | (
-        np.diff(np.cumsum(begins)[np.searchsorted(rows, used)]) > 0
-    )
+    apart = ends_piece(at_s) | (np.diff(np.cumsum(begins)[np.searchsorted(rows, used)]) > 0)
     pieces = np.split(used, np.flatnonzero(apart) + 1) if len(used) else []
     return Selection(
         pieces=[piece for piece in pieces if len(piece) > 1],

@@ -271,6 +271,20 @@ def test_records_that_come_out_of_their_order_are_all_there(held, findings, tmp_
     assert ticks["number"][-1] == 1000
 
 
+@pytest.mark.parametrize("off_s", [-3600.0, 3600.0, -1e12, 1e12])
+def test_a_frame_exposed_at_an_impossible_time_ends_a_piece(held, findings, tmp_path, off_s):
+    def change(record):
+        if record.topic == "/fit/right/tick" and record.sequence == 1000:
+            record.message.mid_exposure_s += off_s
+
+    found = find(find_run([forged(held[1], tmp_path / "forged.mcap", change)]))
+
+    one, other = (each.loops["right"] for each in (found, findings))
+    assert len(one.selection.pieces) == len(other.selection.pieces) + 1
+    assert len(one.selection.rows) == len(other.selection.rows) - 1
+    assert one.residual["az"].rms == pytest.approx(other.residual["az"].rms, rel=1e-2)
+
+
 def test_more_records_than_bytes_in_a_file_are_refused(rig, tmp_path):
     path = tmp_path / "off.mcap"
     record(rig, path, lambda simulation: simulation.run(1.0))
