@@ -42,7 +42,7 @@ def test_a_whole_acquisition_is_driven_by_keys_at_a_terminal(rig, terminal):
     terminal.press("b")
     terminal.until("◐ STANDBY")
     terminal.press("j")
-    terminal.until("JOG siderostat")
+    terminal.until("JOG siderostat", "esc Leave")  # the keys below are drawn last
     terminal.press("Right")
     terminal.press("Escape")
     terminal.until("w Window")  # Escape has arrived: with a key close behind it, it would be Alt
