@@ -283,7 +283,10 @@ def propose(s: Any, r: Any) -> tuple[float, float]:
 
 @compilable()
 def has_moved(s: Any, r: Any) -> bool:
-    """``Attribution.has_moved``; True where no other loop's star is on the frame."""
+    """``Attribution.has_moved``; True where no other loop's star is on the frame.
+
+    In a batch, no loop is at rest and jogged while another searches.
+    """
     if not s.shared:
         return True
     place_px = r.candidate_px

@@ -190,7 +190,10 @@ def carried(monkeypatch):
 
     def run(rig=RIG, **wrong):
         clock, looks = VirtualClock(), itertools.count()
-        now_s = lambda: 0.05 * next(looks)  # noqa: E731
+
+        def now_s():
+            return 0.05 * next(looks)
+
         bench = BenchAmplifiers(clock)
         diodes = BeamDiodes(bench, (0.0, 0.0), range(4))
         hexapod = BenchHexapod(now_s, bench, **wrong)

@@ -1,6 +1,7 @@
 """The Ensemble driver against controllers that differ from the mock, and on its other wires."""
 
 import contextlib
+import select
 import threading
 import time
 
@@ -456,9 +457,9 @@ def test_an_interrupt_between_a_command_and_its_answer_takes_the_power_of_both_a
     monkeypatch.setattr(motors, "amplifiers_of", lambda _siderostat: bench.driver)
     answered = EnsembleLink._reply
 
-    def interrupted(_link, _text, _deadline_s):
+    def interrupted(line, _text, _deadline_s):
         monkeypatch.setattr(EnsembleLink, "_reply", answered)
-        time.sleep(0.05)  # the answer is here when the next command is sent
+        assert select.select([line._port], [], [], 5.0)[0], "no answer came"
         raise KeyboardInterrupt
 
     def step():
