@@ -41,6 +41,7 @@ class Pty(asyncio.ReadTransport):
         super().__init__()
         # The clients' end stays open here too, so that ours sees no error when a client leaves.
         self._ours, self._theirs = os.openpty()
+        self._outgoing = bytearray()
         os.set_blocking(self._ours, False)
         tty.setraw(self._theirs)
         self._speed = getattr(termios, f"B{baud_rate}", None)
@@ -60,9 +61,15 @@ class Pty(asyncio.ReadTransport):
         return self._speed in {None, termios.tcgetattr(self._theirs)[_OUTPUT_SPEED]}
 
     def write(self, data: bytes) -> None:
-        """Send to the pty's reader; without flow control, bytes that are not read are lost."""
-        with suppress(BlockingIOError):
-            os.write(self._ours, data)
+        """Send to the pty's reader; without flow control, bytes that are not read are lost.
+
+        On a line, what is sent at one moment comes without a gap, such as an answer and its second copy. So it
+        goes out in one piece: between two, the machine could stall for longer than the reader waits before it
+        asks again.
+        """
+        if not self._outgoing:
+            asyncio.get_running_loop().call_soon(self._send)
+        self._outgoing += data
 
     def pause_reading(self) -> None:
         """Leave what clients write where it is; they wait when it is much."""
@@ -73,10 +80,18 @@ class Pty(asyncio.ReadTransport):
         asyncio.get_running_loop().add_reader(self._ours, self._read)
 
     def close(self) -> None:
-        """Close both ends."""
+        """Close both ends; what was not sent is forgotten."""
+        self._outgoing.clear()
         self.pause_reading()
         os.close(self._ours)
         os.close(self._theirs)
+
+    def _send(self) -> None:
+        data = bytes(self._outgoing)
+        self._outgoing.clear()
+        if data:
+            with suppress(BlockingIOError):
+                os.write(self._ours, data)
 
     def _read(self) -> None:
         with suppress(BlockingIOError):

@@ -84,6 +84,24 @@ async def test_an_exception_is_framed_too():
         assert await master.hears() == rtu.frame(1, bytes.fromhex("83 02")).hex(" ")
 
 
+@in_a_loop
+async def test_an_answer_that_comes_twice_goes_out_in_one_piece(monkeypatch):
+    pieces = []
+
+    def write(end, data):
+        pieces.append(data.hex(" "))
+        return os_write(end, data)
+
+    os_write = os.write
+    async with line() as master:
+        master.faults.set(Fault(device="right.dac", kind="duplicate"))
+        monkeypatch.setattr(os, "write", write)
+        master.send(READ)
+        answer = "01 03 02 00 07 f9 86"
+        assert await master.hears() == f"{answer} {answer}"
+    assert pieces == [READ.hex(" "), f"{answer} {answer}"]
+
+
 @pytest.mark.parametrize(
     "frame",
     [
