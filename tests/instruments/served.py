@@ -20,11 +20,18 @@ from fitctl.service.service import Service
 from fitctl.service.telemetry_buffer import ServiceState, TelemetryBuffer
 from fitctl.simulation.simulation import Simulation
 
+_GIVEN = set()
+
 
 def free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
+    """A port of TCP that nobody has now and no earlier call gave: the kernel may name one twice."""
+    while True:
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            port = probe.getsockname()[1]
+        if port not in _GIVEN:
+            _GIVEN.add(port)
+            return port
 
 
 def rig_in(folder, *settings):
