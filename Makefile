@@ -52,14 +52,16 @@ test: lint contract  ## Run lint, import contract, types, and all tests without 
 
 # Workers that begin at once would each compile all tests. What fails here is printed by the tests themselves.
 warm: $(READY)
-	@$(BIN)/pytest --collect-only --quiet --ignore tests/system > /dev/null || true
+	@for half in 'tests/[a-l]*/' 'tests/[m-z]*/ tests/*.py'; do \
+	    $(BIN)/pytest --collect-only --quiet --ignore tests/system $$half > /dev/null & \
+	done; wait
 
 lint: $(READY)
 	$(BIN)/ruff check $(SOURCES)
 	$(BIN)/ruff format --check $(SOURCES)
 
 types: $(READY)
-	$(BIN)/mypy
+	$(BIN)/pyrefly check
 
 contract: $(READY)
 	$(BIN)/lint-imports
@@ -105,13 +107,13 @@ test-faults-all: $(READY)
 
 # As much as fits into continuous integration; with the PART_SEED that it prints, a run is repeated.
 PART_SEED := $(or $(PART_SEED),$(shell od -An -N2 -tu2 /dev/urandom | tr -d ' '))
-test-long-part: export FITCTL_TESTS_PART = 70
-test-instrument-part: export FITCTL_TESTS_PART = 16
-test-faults-part: export FITCTL_TESTS_PART = 25
+test-long-part: export FITCTL_TESTS_PART = 45
+test-instrument-part: export FITCTL_TESTS_PART = 10
+test-faults-part: export FITCTL_TESTS_PART = 20
 %-part: export FITCTL_TESTS_SEED = $(PART_SEED)
-test-long-part: test-long  ## Run 70 of the tests of test-long, drawn at random
-test-instrument-part: test-instrument  ## Run 16 tests of test-instrument, drawn at random, and those that must run alone
-test-faults-part: test-faults-all  ## Run 25 entries of the whole fault catalogue, drawn at random
+test-long-part: test-long  ## Run 45 of the tests of test-long, drawn at random
+test-instrument-part: test-instrument  ## Run 10 tests of test-instrument, drawn at random, and those that must run alone
+test-faults-part: test-faults-all  ## Run 20 entries of the whole fault catalogue, drawn at random
 
 test-faults-testbed: $(READY)  ## Run the fault catalogue's entries for the whole testbed
 	$(BIN)/pytest -m "fault and testbed" $(FAULTS) $(ARGS)
@@ -234,5 +236,5 @@ lock: $(READY)  ## Resolve the requirements again (needs uv and npm)
 	npm --prefix requirements/site install --package-lock-only --omit-lockfile-registry-resolved --silent
 
 clean:  ## Remove .venv and caches
-	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	rm -rf $(VENV) .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 	find fitctl tests benchmarks -name __pycache__ -prune -exec rm -rf {} +

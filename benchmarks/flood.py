@@ -16,7 +16,7 @@ import tempfile
 import time
 from collections import defaultdict
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import psutil
@@ -81,7 +81,8 @@ def measure(options: argparse.Namespace) -> dict[str, Window]:
 
 def together(some: list[Window]) -> Window:
     """All windows of one flood as one."""
-    ticks, timing, *sums = zip(*some, strict=True)
+    columns: list[Any] = list(zip(*some, strict=True))
+    ticks, timing, *sums = columns
     return Window(
         [tick for part in ticks for tick in part],
         [second for part in timing for second in part],

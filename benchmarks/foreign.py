@@ -34,8 +34,8 @@ def udp_echo(port: int) -> None:
         def connection_made(self, transport: asyncio.BaseTransport) -> None:
             self.transport = cast(asyncio.DatagramTransport, transport)
 
-        def datagram_received(self, data: bytes, address: tuple[str, int]) -> None:
-            self.transport.sendto(data, address)
+        def datagram_received(self, data: bytes, addr: tuple[str, int]) -> None:
+            self.transport.sendto(data, addr)
 
     async def serve() -> None:
         loop = asyncio.get_running_loop()

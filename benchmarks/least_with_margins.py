@@ -91,7 +91,7 @@ def least(truth: Basis, overshoot: float, most_s: float, most_t: float) -> Least
         of_s, of_t = np.split(scale * multipliers, 2)
         _, s2, t2, left_px2 = best(of_s, of_t)
         missed = np.concatenate([s2 - most_s**2, t2 - most_t**2])
-        return -left_px2 / scale - multipliers @ missed, -missed
+        return float(-left_px2 / scale - multipliers @ missed), -missed
 
     begin = np.full(2 * len(hz), 1e-3)
     options = {"maxiter": 4000, "maxfun": 4000, "ftol": 1e-12, "gtol": 1e-7}

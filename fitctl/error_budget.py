@@ -105,7 +105,8 @@ def theory_from_plain(plain: Mapping[str, Any]) -> LoopTheory:
         for name, value in plain.items()
     }
     unknown = {name: math.nan for name, value in plain.items() if value is None}
-    return LoopTheory(**values | unknown | {"sensitivity": real + 1j * imaginary})
+    values |= unknown | {"sensitivity": real + 1j * imaginary}
+    return LoopTheory(**values)
 
 
 class Motion(NamedTuple):

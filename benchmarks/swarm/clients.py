@@ -249,7 +249,7 @@ class RunningSequence:
         self.ended = False
         self._link = link
         self._steps = [STEPS[word](loop) for word in words]
-        self._contact = Contact(link, rig, "swarm", len(words))  # type: ignore[arg-type]
+        self._contact = Contact(link, rig, "swarm", len(words))  # pyrefly: ignore[bad-argument-type]
 
     def run(self) -> None:
         """Run the sequence; called in its own thread."""

@@ -198,7 +198,7 @@ class Instrument:
             photodiodes = SwarmPhotodiodes(part, time, rig, name, random)
             self._add(f"{name} photodiodes", photodiodes)
             return LoopDevices(amplifiers, photodiodes=photodiodes, bus=bus)
-        mirror = SimulatedMirror(part, time, rig, name)  # type: ignore[arg-type]
+        mirror = SimulatedMirror(part, time, rig, name)  # pyrefly: ignore[bad-argument-type]
         written, made_safe = self.invariants.motion.volts, self.invariants.motion.mirror_moved
         dac = SwarmDac(mirror, time, rig, name, random, written, made_safe)
         piezo = SwarmPiezo(mirror, time, rig, name, random)

@@ -58,7 +58,7 @@ NO_EXCEPTION = "no exception escapes"
 ANSWERED_ONCE = "a command is answered once"
 POWER_S = 1.0  # a loop may have power without need, or need without power, no longer than this
 _CAUSE_S = 10.0  # before a fault, in which its cause must have been
-_LEADS_TO = {
+_LEADS_TO: dict[type, frozenset[Mode]] = {
     Off: frozenset({Mode.OFF}),
     Release: frozenset({Mode.OFF, Mode.SAFE, Mode.STANDBY}),
     Stop: AT_REST,

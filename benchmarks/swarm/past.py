@@ -77,7 +77,7 @@ def _oldest_frame(self: CameraWatch, _meanwhile: Callable[[], float]) -> Frame |
         frame = self._camera.next_frame(2 * self._period_s)
     except Exception as error:
         self.ready = False
-        self._failed(error)  # type: ignore[arg-type]
+        self._failed(error)  # pyrefly: ignore[bad-argument-type]
         return None
     if frame is not None:
         self._last_frame_s = self._clock.now_s()

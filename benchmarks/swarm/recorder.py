@@ -144,7 +144,7 @@ class SwarmRecorder:
         self.disk_is_full = False
         self._time = time
         self._queue = queue
-        self._wire: Wire = queue._socket  # type: ignore[assignment]
+        self._wire: Wire = queue._socket  # pyrefly: ignore[bad-assignment]
         self._unflushed: list[int] = []
         self._starts = 0
         self._stays_dead = False
@@ -177,7 +177,7 @@ class SwarmRecorder:
         """
         self._stays_dead = True
         reported: list[str] = []
-        finish_log(self._queue, self, reported.append)  # type: ignore[arg-type]
+        finish_log(self._queue, self, reported.append)  # pyrefly: ignore[bad-argument-type]
         missing = self._queue.offered - len(self.written) - self._queue.lost
         found = [re.search(r"confirm the last (\d+) of", line) for line in reported]
         unconfirmed = sum(int(match[1]) for match in found if match)

@@ -238,13 +238,13 @@ class SwarmService(Service):
             invariants.obeyed(command, sender)
             post(command, reply, sender, address)
 
-        supervisor.post = watched_post  # type: ignore[assignment,method-assign]
+        supervisor.post = watched_post  # pyrefly: ignore[bad-assignment]
         self._admission = _WatchedAdmission(supervisor.rig.service.lease_s, invariants)
         publisher.supervisor = supervisor
-        self._publisher = publisher  # type: ignore[assignment]
+        self._publisher = publisher  # pyrefly: ignore[bad-assignment]
         self._time = time
         self._invariants = invariants
-        self._wire: _Wire = self._context  # type: ignore[assignment]
+        self._wire: _Wire = self._context  # pyrefly: ignore[bad-assignment]
         self._wire.due_s = time.now_s()
         self._wire.answered = self._take_answer
         self._random = self._wire.random
@@ -260,7 +260,7 @@ class SwarmService(Service):
         kind = type(record)
         if kind in _SHOWN:
             # A change into the same mode leaves the reason of the one before.
-            if kind is not ModeChange or record.source != record.target:  # type: ignore[union-attr]
+            if kind is not ModeChange or record.source != record.target:  # pyrefly: ignore[missing-attribute]
                 self.newest[kind, getattr(record, "loop", "")] = record
             self.events += kind is Event
         self.buffer.add(record)

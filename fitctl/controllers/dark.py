@@ -50,7 +50,7 @@ class Dark:
         A bad pixel gets the mean of the good ones next to it.
         """
         part = (slice(top, top + height), slice(left, left + width))
-        light_dn = image[part] - self._dark_dn[part]
+        light_dn: Floats = image[part] - self._dark_dn[part]  # pyrefly: ignore[bad-assignment]
         for row, column, rows, columns in self._bad:
             if top <= row < top + height and left <= column < left + width:
                 near_dn = image[rows, columns] - self._dark_dn[rows, columns]

@@ -52,7 +52,9 @@ def _ramp_slopes(risen_v: Floats, displacement_m: Floats, breakpoints_v: Floats)
     curves = displacement_m.reshape(-1, len(risen_v)).T
     constant = np.ones((len(risen_v), 1))
     solution, *_ = np.linalg.lstsq(np.hstack([within, constant]), curves, rcond=None)
-    return np.asarray(solution[:-1].T.reshape(*displacement_m.shape[:-1], len(breakpoints_v)))
+    return np.asarray(
+        solution[:-1].T.reshape(*displacement_m.shape[:-1], len(breakpoints_v)), float
+    )
 
 
 def place_breakpoints(at_v: Floats, bend: Floats, end_v: float, count: int = ELEMENTS) -> Floats:

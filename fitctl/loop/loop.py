@@ -262,7 +262,7 @@ class Loop(ABC):
         )
         return True
 
-    def _read_link(self, _now_s: float) -> AzEl:
+    def _read_link(self, now_s: float) -> AzEl:
         """Motor angles of the siderostat of the loop's link, read now; NaN without a link."""
         return math.nan, math.nan
 

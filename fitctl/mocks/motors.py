@@ -72,20 +72,20 @@ class WiredMotors:
         ]
         return [turned[self._axes.index(axis)] for axis in range(2)]
 
-    def command_velocity_rad_s(self, first: float, second: float) -> None:
-        """Drive the motors on axis 0 and 1."""
-        commanded = (first * self._velocity_gains[0], second * self._velocity_gains[1])
+    def command_velocity_rad_s(self, az: float, el: float) -> None:
+        """Drive the motors on axis 0, which gets `az`, and on axis 1."""
+        commanded = (az * self._velocity_gains[0], el * self._velocity_gains[1])
         turned = (
             sign * commanded[axis]
             for sign, axis in zip(self._velocity_signs, self._axes, strict=True)
         )
-        az, el = (
+        turned_az, turned_el = (
             0.0 if abs(at) >= end and at * velocity > 0 else velocity
             for velocity, at, end in zip(
                 turned, self._motors.position_rad(), self._ends_rad, strict=True
             )
         )
-        self._motors.command_velocity_rad_s(az, el)
+        self._motors.command_velocity_rad_s(turned_az, turned_el)
 
     def set_enabled(self, axis: int, enabled: bool) -> None:
         """Give the motor on one axis current, or take it away."""

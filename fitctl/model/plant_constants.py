@@ -213,7 +213,7 @@ def air_constants(air: AirPath, step_s: float) -> AirConstants:
         weights=air_path.bridge_weights(steps, step_s),
         # The least that lets still air, whose covariance is zero, through.
         initial=np.asarray(
-            np.linalg.cholesky(air_path.stationary_covariance(air) + 1e-300 * np.eye(2))
+            np.linalg.cholesky(air_path.stationary_covariance(air) + 1e-300 * np.eye(2)), float
         ),
         relative=air.relative_rms_px / rms_px if rms_px > 0 else 0.0,
     )

@@ -8,6 +8,7 @@ from scipy.linalg import expm
 
 from fitctl.config import Structure
 
+Complexes = NDArray[np.complex128]
 Floats = NDArray[np.float64]
 
 
@@ -40,11 +41,11 @@ def mode_matrices(structure: Structure, step_s: float) -> tuple[Floats, Floats]:
     return np.array(transitions), np.array(gains)
 
 
-def frequency_response(structure: Structure, frequency_hz: Floats) -> Floats:
+def frequency_response(structure: Structure, frequency_hz: Floats) -> Complexes:
     """Mirror motion over commanded motion, shape (frequencies, 2, 2), complex; columns are inputs."""
     shapes = mode_shapes(structure)
     s = 2j * np.pi * np.asarray(frequency_hz)
-    response = (1 - structure.participation) * np.eye(2)[None].astype(complex)
+    response = np.array((1 - structure.participation) * np.eye(2)[None], complex)
     for shape, mode_hz in zip(shapes, structure.mode_hz, strict=True):
         omega = 2 * np.pi * mode_hz
         gain = omega**2 / (s**2 + 2 * structure.damping * omega * s + omega**2)

@@ -41,7 +41,7 @@ def _method(kind: type[steps.Step]) -> Callable[..., Any]:
         for key in (*own, *(key for key in fields if key not in own))
     ]
     first = inspect.Parameter("self", inspect.Parameter.POSITIONAL_ONLY)
-    method.__signature__ = inspect.Signature([first, *parameters])  # type: ignore[attr-defined]
+    method.__signature__ = inspect.Signature([first, *parameters])  # pyrefly: ignore[missing-attribute]
     return method
 
 

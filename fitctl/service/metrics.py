@@ -158,7 +158,7 @@ class _Handler(WSGIRequestHandler):
         with suppress(OSError):  # it has just ended
             self.connection.shutdown(socket.SHUT_RDWR)
 
-    def log_message(self, *_: object) -> None:
+    def log_message(self, format: str, *args: object) -> None:
         pass
 
 

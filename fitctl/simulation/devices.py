@@ -231,7 +231,7 @@ class SimulatedHexapod:
         """Nothing to connect."""
         return _identity("hexapod")
 
-    def reference(self, _is_wanted: Callable[[], bool] = lambda: True) -> None:
+    def reference(self, is_wanted: Callable[[], bool] = lambda: True) -> None:
         """Begin to go to where all axes are at zero; the real one returns when it is there."""
         self._go_to(Pose(), self._limits)
         self._referenced = True

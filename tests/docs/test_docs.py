@@ -48,7 +48,7 @@ OUTSIDE = {
     "ssh",
     "tmux",
 }
-INSTALLED = {"rerun", "pymcap-cli", "pytest", "python", "ruff", "mypy"}
+INSTALLED = {"rerun", "pymcap-cli", "pytest", "python", "ruff", "pyrefly"}
 NEARBY_PX = np.array([30.0, -10.0])  # a star that is found and held within 20 s
 # Every documented command that the test below does not run, and why; a test named here runs its like.
 NOT_RUN = {

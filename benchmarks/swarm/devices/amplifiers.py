@@ -92,9 +92,9 @@ class SwarmAmplifiers:
         if self._driver == "cia402":
             self.master_timeout_s = device.master_heartbeat_timeout_s
         elif self._driver == "bal_analog":
-            self.master_timeout_s = mock.bal_analog.watchdog_s  # type: ignore[union-attr]
+            self.master_timeout_s = mock.bal_analog.watchdog_s  # pyrefly: ignore[missing-attribute]
         else:
-            limit_units = mock.ensemble.software_limit_units  # type: ignore[union-attr]
+            limit_units = mock.ensemble.software_limit_units  # pyrefly: ignore[missing-attribute]
             self._limit_rad = math.tau * limit_units
         self._period_s = 1.0 / siderostat.servo.rate_hz
         self._alive_s = 3 * getattr(device, "drive_heartbeat_s", 0.1)
@@ -103,7 +103,7 @@ class SwarmAmplifiers:
         self._powered_unread = powered_unread
         self._encoders_read = encoders_read
         self._was_read = False
-        self._inner = SimulatedAmplifiers(plant, time, siderostat.encoder_counts_per_rev)  # type: ignore[arg-type]
+        self._inner = SimulatedAmplifiers(plant, time, siderostat.encoder_counts_per_rev)  # pyrefly: ignore[bad-argument-type]
         self._last_master_s = -math.inf
         self._heard_s = 0.0
         self._watched = False

@@ -39,8 +39,8 @@ class SwarmHexapod(SimulatedHexapod):
         sent: Callable[[Pose, float], None] = lambda _pose, _velocity_mm_s: None,
     ) -> None:
         _, mocks = rig.mock_parts()
-        device = rig.collector.hexapod  # type: ignore[union-attr]
-        super().__init__(plant.collector, time, device, mocks.hexapod)  # type: ignore[arg-type]
+        device = rig.collector.hexapod  # pyrefly: ignore[missing-attribute]
+        super().__init__(plant.collector, time, device, mocks.hexapod)  # pyrefly: ignore[bad-argument-type]
         self.line = Line("hexapod", device.endpoint, time, random, 0.01, device.response_timeout_s)
         self._time = time
         self._sent = sent

@@ -44,7 +44,7 @@ class SwarmDac:
         self._time = time
         self._written = written
         self._made_safe = made_safe
-        settings = mocks.loops[loop_name].dac  # type: ignore[union-attr]
+        settings = mocks.loops[loop_name].dac  # pyrefly: ignore[missing-attribute]
         self._watchdog_s, self._safe_v = settings.watchdog_s, settings.safe_v
         self._written_s = -math.inf
         self._watched = False

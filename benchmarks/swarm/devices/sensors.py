@@ -34,7 +34,7 @@ class SwarmCamera(SimulatedCamera):
     """The camera on its network: frames arrive late, all at once, or not at all."""
 
     def __init__(self, rig: Rig, time: VirtualTime, plant: Plant, random: Random) -> None:
-        super().__init__(rig, time, plant)  # type: ignore[arg-type]
+        super().__init__(rig, time, plant)  # pyrefly: ignore[bad-argument-type]
         device = rig.camera.device
         self.line = Line("camera", device.endpoint, time, random, 0.002, device.response_timeout_s)
         self._time = time
@@ -136,7 +136,7 @@ class SwarmPhotodiodes(SimulatedPhotodiodes):
     def __init__(
         self, plant: MetrologyPart, time: VirtualTime, rig: Rig, loop_name: str, random: Random
     ) -> None:
-        super().__init__(plant, time, rig, loop_name)  # type: ignore[arg-type]
+        super().__init__(plant, time, rig, loop_name)  # pyrefly: ignore[bad-argument-type]
         device = rig.metrology_loops[loop_name].sensor.device
         self.line = Line(
             "photodiodes", device.endpoint, time, random, 0.001, device.response_timeout_s

@@ -180,7 +180,7 @@ class Cia402Bench(AmplifierBench):
 
     def __init__(self, time: WireTime, troubles: Iterator[Trouble | None]) -> None:
         super().__init__(time, troubles)
-        self._mock = Cia402DriveMock(self.siderostat, self.motors, port=0, adapter=self)  # type: ignore[arg-type]
+        self._mock = Cia402DriveMock(self.siderostat, self.motors, port=0, adapter=self)  # pyrefly: ignore[bad-argument-type]
         self._mock._control.set_period(0.002)
         self._mock._reset_communication()
         self.driver = Cia402Amplifiers(self.siderostat)

@@ -221,7 +221,7 @@ class CameraBench:
             msg = f"exposure {block} is frame {frame.number}, after {self._last}, with {counts}"
             raise Mistaken(msg)
         self._last = exposure, frame, counts
-        network, port = self.network, self.driver._stream.port  # type: ignore[union-attr]
+        network, port = self.network, self.driver._stream.port  # pyrefly: ignore[missing-attribute]
         self._healed += network.lost[port, block]
         most = sum(number for (to, one), number in network.troubled.items() if to == port and one)
         if not self._healed <= counts.packets_lost <= most:

@@ -380,7 +380,7 @@ def on(network: Network) -> Iterator[None]:
         stack.enter_context(patch("fitctl.mocks.gige.stream.socket", own))
         stack.enter_context(patch("fitctl.mocks.gige.camera.listen", listen))
         before = asyncio._get_running_loop()
-        asyncio._set_running_loop(EventLoop(time))  # type: ignore[arg-type]
+        asyncio._set_running_loop(EventLoop(time))  # pyrefly: ignore[bad-argument-type]
         try:
             yield
         finally:

@@ -240,7 +240,7 @@ class HexapodBench(Bench):
 
     def __init__(self, time: WireTime, troubles: Iterator[Trouble | None]) -> None:
         rig = rig_of("fit-testbed.toml", "mocks.hexapod.referenced=true")
-        device: Any = rig.collector.hexapod  # type: ignore[union-attr]
+        device: Any = rig.collector.hexapod  # pyrefly: ignore[missing-attribute]
         settings: Any = rig.mock_parts()[1].hexapod
         super().__init__(
             time,
@@ -341,7 +341,7 @@ def run_wire(
     holder: list[Bench] = []
     # The mock's timers need the wire's event loop, but the bench makes the wire.
     wire = _Deferred(lambda: holder[0].wire)
-    with virtual(time, wire):  # type: ignore[arg-type]
+    with virtual(time, wire):  # pyrefly: ignore[bad-argument-type]
         bench = BENCHES[name](time, iter(troubles))
         holder.append(bench)
         with closing(bench.driver):

@@ -396,7 +396,7 @@ def virtual(time: WireTime, wire: Wire) -> Iterator[None]:
         for name, stand_in in adapter.items():
             stack.enter_context(patch(f"fitctl.drivers.cia402.link.{name}", stand_in))
         before = asyncio._get_running_loop()
-        asyncio._set_running_loop(time)  # type: ignore[arg-type]
+        asyncio._set_running_loop(time)  # pyrefly: ignore[bad-argument-type]
         try:
             yield
         finally:

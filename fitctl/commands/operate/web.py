@@ -78,10 +78,10 @@ def _nothing_from_elsewhere(host: str) -> str:
     )
 
 
-def _guard(web, address: str, key: str) -> _Handler:  # type: ignore[no-untyped-def]  # a module
+def _guard(web, address: str, key: str) -> _Handler:  # pyrefly: ignore[implicit-any-parameter]  # a module
     host = address.removeprefix("http://")
 
-    async def guard(request, handler):  # type: ignore[no-untyped-def]  # aiohttp's
+    async def guard(request, handler):  # pyrefly: ignore[implicit-any-parameter, unannotated-return]  # aiohttp's
         at_home = request.host == host and request.headers.get("Origin", address) == address
         given = request.path.split("/")[1]  # of any characters, which strings are not compared with
         if at_home and secrets.compare_digest(given.encode(errors="replace"), key.encode()):

@@ -96,7 +96,7 @@ def init(
             )
             raise ConfigError(msg)
     given = {
-        device: text and chosen(base, device, text)
+        device: chosen(base, device, text) if text else None
         for device, text in options.items()
         if device in DEVICES[base]
     }

@@ -82,7 +82,7 @@ def _pulse(motors: Motors, axis: int, site: Site) -> NDArray[np.float64]:
         before = np.array(motors.position_rad)
         velocity = way * PULSE_RAD / PULSE_S
         command = (velocity, 0.0) if axis == 0 else (0.0, velocity)
-        elapsed_s = motors.drive(lambda command=command: command, PULSE_S, STOP_RAD)  # type: ignore[misc]
+        elapsed_s = motors.drive(lambda command=command: command, PULSE_S, STOP_RAD)
         motors.stand(_SETTLE_S)
         found.append((np.array(motors.position_rad) - before) / (velocity * elapsed_s))
     forward, back = found

@@ -92,7 +92,8 @@ class BeamWatch:
 
     def move_m(self, way_m: Floats) -> None:
         """Move the beam at the array."""
-        self.servo.turn_to(self.servo.goal_rad + np.linalg.solve(self._m_per_rad, way_m))
+        way_rad = np.linalg.solve(self._m_per_rad, way_m).astype(np.float64)
+        self.servo.turn_to(self.servo.goal_rad + way_rad)
 
 
 def beam_loop(site: Site) -> MetrologyLoop:

@@ -38,7 +38,7 @@ def identification_moves(what: str) -> Callable[[Site], str]:
 
     def moves(site: Site) -> str:
         try:
-            drives = EXPERIMENTS[what].plan(site.rig, site.name)  # type: ignore[misc]
+            drives = EXPERIMENTS[what].plan(site.rig, site.name)  # pyrefly: ignore[not-callable]
         except IdentifyError as error:
             return f"nothing: {error}"
         most = dict.fromkeys((*STACKS, *FSM, *SIDEROSTAT), 0.0)
@@ -68,7 +68,7 @@ def _identify(site: Site, what: str) -> Outcome:
     """
     experiment = EXPERIMENTS[what]
     try:
-        drives = experiment.plan(site.rig, site.name)  # type: ignore[misc]
+        drives = experiment.plan(site.rig, site.name)  # pyrefly: ignore[not-callable]
         with supervised(site) as loop:
             loop.acquire()
             time.sleep(SETTLED_S)
@@ -97,7 +97,7 @@ Compared = tuple[dict[str, float], bool]
 
 
 def _air_path(site: Site, finding: Finding) -> Compared:
-    assert isinstance(finding, AirPathResult)  # noqa: S101 - for mypy
+    assert isinstance(finding, AirPathResult)  # noqa: S101 - for the type checker
     known = site.loop.vernier.air_path
     pairs = {
         "gain_px": (finding.joint.gain_px, known.gain_px),

@@ -278,6 +278,6 @@ def scanned(site: Site, scan: CollectorScan, *overrides: str) -> Scanned:
 
 def scanned_from(found: Finding, figures_json: str) -> Scanned:
     """From what the log gave, and the figures of the scan's attempt."""
-    assert isinstance(found, FeedforwardResult)  # noqa: S101 - for mypy
+    assert isinstance(found, FeedforwardResult)  # noqa: S101 - for the type checker
     figures = msgspec.json.decode(figures_json, type=dict[str, float])
     return Scanned(found, figures["rms_az_px"], figures["rms_el_px"])

@@ -109,7 +109,8 @@ def _travel(siderostat: AnySiderostat) -> Iterator[Conflict]:
                 ),
             )
     counts = travel_rad / siderostat.encoder_count_rad
-    most = {Cia402Device: _INT32, BalAnalogDevice: _HALF_COUNTER}.get(type(device), math.inf)
+    of_driver: dict[type, float] = {Cia402Device: _INT32, BalAnalogDevice: _HALF_COUNTER}
+    most = of_driver.get(type(device), math.inf)
     if counts > most:
         fits = most / counts
         yield Conflict(
@@ -250,5 +251,5 @@ def _can_load(key: str, drives: int, bitrate: int, rate_hz: float) -> Iterator[C
 
 
 def _bitrates(needed: float) -> str:
-    allowed: tuple[Any, ...] = Cia402Device.model_fields["bitrate"].annotation.__args__  # type: ignore[union-attr]
+    allowed: tuple[Any, ...] = Cia402Device.model_fields["bitrate"].annotation.__args__  # pyrefly: ignore[missing-attribute]
     return " or ".join(str(one) for one in allowed if one >= needed)

@@ -137,7 +137,7 @@ def basis(rig: Rig, loop_name: str) -> Basis:
 
 def design_parameters(basis: Basis, *sections: str) -> dict[str, Any]:
     """What a design was made from, plain enough for a file: the loop, and sections of the settings."""
-    parameters = {
+    parameters: dict[str, Any] = {
         "noise_px": basis.noise_px,
         "air_path": basis.air_path.model_dump(),
         "coarse_per_s": basis.coarse_per_s,

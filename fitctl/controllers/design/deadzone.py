@@ -71,7 +71,7 @@ def deadzone_response(design: Design, basis: Basis, omega_rad_s: Floats) -> NDAr
     b[0], b[n] = -1.0, 1.0
     wanted = np.append(loop.command[0] + loop.command_error[0] * loop.star, design.d[0, 1])
     z = np.exp(1j * omega_rad_s * basis.period_s)[:, None, None]
-    return np.asarray(np.linalg.solve(z * np.eye(n + 1) - a, b)[..., 0] @ wanted)
+    return np.asarray(np.linalg.solve(z * np.eye(n + 1) - a, b)[..., 0] @ wanted, complex)
 
 
 def deadzone_result(design: Design, basis: Basis) -> DeadzoneResult:

@@ -154,7 +154,7 @@ def in_pairs(roots: Complexes) -> Complexes:
     if np.any(np.abs(apart) > _ROUNDING * np.abs(roots).max(initial=1.0)):
         msg = "roots of a real polynomial do not come in pairs"
         raise ArithmeticError(msg)
-    return np.concatenate([roots[real].real, upper, upper.conj()])
+    return np.concatenate([roots[real].real, upper, upper.conj()]).astype(complex)
 
 
 def without_fast_poles(compensator: Compensator) -> Compensator:

@@ -148,7 +148,7 @@ def fit_plate_scale(time_s: Floats, star_px: Floats, swings: list[Swing]) -> Pla
         )
         covariance = inverse @ (scores.T @ scores) @ inverse
         deviation[:, axis] = np.sqrt(np.diag(covariance)[: len(swings)])
-    matrix = solution[: len(swings)].T
+    matrix = solution[: len(swings)].T.astype(np.float64)
     return PlateScaleFit(
         mirror=matrix[:, :2],
         siderostat=matrix[:, 2:],

@@ -34,7 +34,7 @@ class OnPaper:
     def __init__(self, design: Design, basis: Basis) -> None:
         loop = sampled_loop(design, basis)
         closed = loop.a + np.outer(loop.b, loop.star)
-        self._system = np.block([[closed, loop.b[:, None]], [loop.star, 1.0]])
+        self._system = np.block([[closed, loop.b[:, None]], [loop.star[None], np.ones((1, 1))]])
         self._given = np.zeros((len(self._system), 2))
 
     def restart(self) -> None:
