@@ -13,6 +13,8 @@ import pytest
 from fitctl.config import Rig, default_rig_path, load_rig
 from fitctl.processes import name_held
 
+gc.disable()  # until all tests are collected: what they import and their parameters stay
+
 pytest_plugins = ["pytester", "skips", "instruments.virtual_instrument"]
 
 # The machine itself may stand still for 100 ms: an example's time says nothing about the code. The examples
@@ -47,6 +49,7 @@ def pytest_collection_finish():
     gc.collect()
     gc.freeze()
     gc.set_threshold(10_000, 10, 10)
+    gc.enable()
 
 
 @pytest.fixture(scope="session")

@@ -2,6 +2,7 @@
 
 import ast
 import pickle
+import re
 from pathlib import Path
 
 import numpy as np
@@ -43,10 +44,13 @@ def breaches(tree):
 
 
 def test_no_module_of_fitctl_unpickles_or_evaluates():
+    named = re.compile("|".join({*UNPICKLING, *CALLS, "allow_pickle"}))
+    modules = {path: path.read_text() for path in PACKAGE.rglob("*.py")}
     found = {
         f"{path.relative_to(PACKAGE)}: {what}"
-        for path in PACKAGE.rglob("*.py")
-        for what in breaches(ast.parse(path.read_text()))
+        for path, text in modules.items()
+        if named.search(text)  # parsing all takes seconds
+        for what in breaches(ast.parse(text))
     }
     assert found == set()
 

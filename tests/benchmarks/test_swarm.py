@@ -46,7 +46,7 @@ OVERTAKEN = Plan(
 )
 
 
-@pytest.mark.parametrize("seed", [1, 3])
+@pytest.mark.parametrize("seed", [2, 16])  # of two kinds of amplifiers, and quick
 def test_nothing_is_violated_whatever_fails(seed):
     assert run_plan(plan_of(seed)).violations == []
 

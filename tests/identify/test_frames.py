@@ -184,6 +184,7 @@ def test_stages_that_always_move_give_no_rest(rig):
         list(frames_of_records(still_from(0, 0), "right", rig.camera))
 
 
+@pytest.mark.long
 def test_frames_of_records_and_of_their_log_are_the_same(rig, tmp_path):
     records = []
     for made in still_from(100, 200, ticks=250):

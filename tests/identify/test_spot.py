@@ -94,8 +94,8 @@ def with_bad_pixels(rig, folder, bad):
     return load_rig(default_rig_path(), [f"camera.dark_file={folder / 'dark.npy'}"])
 
 
-@pytest.mark.parametrize("reads_dn", [0, 1000, 65535])
-@pytest.mark.parametrize("bad", [[(20, 20)], [(20, 21)], [(20, 20), (19, 22)]])
+@pytest.mark.parametrize("reads_dn", [0, pytest.param(1000, marks=pytest.mark.long), 65535])
+@pytest.mark.parametrize("bad", [[(20, 20)], [(20, 20), (19, 22)]])
 def test_bad_pixels_do_not_count(rig, tmp_path, bad, reads_dn):
     """The star's peak is in row 20, column 20."""
     rig = with_bad_pixels(rig, tmp_path, tuple(np.transpose(bad)))

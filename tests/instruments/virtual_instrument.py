@@ -1,8 +1,8 @@
 """Fixtures of an instrument on the virtual clock, which the tests of several rooms share."""
 
 import pytest
-from instruments.simulated import NEAR, until
-from samples.replay_courses import SOON, hold_a_star
+from instruments.simulated import NEAR, SOON, until
+from samples.replay_courses import hold_a_star
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.messages.modes import Mode

@@ -452,7 +452,7 @@ def test_less_of_an_alias_is_counteracted_while_the_mirror_may_move_much_less(
     assert part(0.7) < part(0.9)
 
 
-@pytest.mark.parametrize("fastest_line_hz", [30.0, math.inf])
+@pytest.mark.parametrize("fastest_line_hz", [30.0, pytest.param(math.inf, marks=pytest.mark.long)])
 def test_a_gain_that_is_known_whether_a_line_is_an_alias_or_not_counts(
     paper, fixed, fastest_line_hz
 ):
@@ -463,7 +463,7 @@ def test_a_gain_that_is_known_whether_a_line_is_an_alias_or_not_counts(
     assert known.mirror_gain == pytest.approx(0.73, abs=0.05)
 
 
-@pytest.mark.parametrize("hz", [44.0, 57.4])
+@pytest.mark.parametrize("hz", [44.0, pytest.param(57.4, marks=pytest.mark.long)])
 def test_a_gain_that_a_fast_line_imitates_is_left_to_the_margins(paper, fixed, hz):
     truth = dataclasses.replace(paper, lines=(Line(hz, 0.005, 0.07),))
     _, series = held(truth, fixed, TWO_MINUTES_S, 5)

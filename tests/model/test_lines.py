@@ -101,6 +101,7 @@ def test_a_line_begins_as_it_goes_on():
     assert np.mean(begins) == pytest.approx(0.0, abs=4 / math.sqrt(2000))
 
 
+@pytest.mark.long
 def test_a_sine_is_a_sine_of_any_phase():
     moved = motion_px(line(frequency_hz=48.9, damping=0.0), 2000)[:, 0]
     time_s = np.arange(1, len(moved) + 1) * STEP_S

@@ -5,8 +5,8 @@ import math
 import msgspec
 import numpy as np
 import pytest
-from instruments.simulated import failing
-from samples.replay_courses import SOON, TIMEOUT, replayed
+from instruments.simulated import SOON, failing
+from samples.replay_courses import TIMEOUT, replayed
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.logging.errors import LogError

@@ -1,7 +1,7 @@
 """What a simulation does while it is logged, and the replay of such a log."""
 
 import pytest
-from instruments.simulated import TWO_STARS, darken, failing, until
+from instruments.simulated import SOON, TWO_STARS, darken, failing, until
 from samples.learner_reports import SHAKEN
 from samples.learner_reports import report as learner_report
 
@@ -29,7 +29,6 @@ from fitctl.replay.files import logged_files
 from fitctl.replay.log import read_steps, whole_run
 from fitctl.replay.replay import replay
 
-SOON = "loops.right.coarse.reach_fraction=0.7"  # seconds less in COARSE
 TIMEOUT = DeviceTimeout("device", "here", "an answer", "none", "look")
 MOVED = DeviceMismatch("piezo", "here", "its limit", "another", "set it back")
 SCAN = [

@@ -2,6 +2,7 @@
 
 import msgspec
 import pytest
+from instruments.simulated import SOON
 from sequence_runs import run_sequence
 
 from fitctl.config import default_rig_path, load_rig
@@ -11,7 +12,7 @@ from fitctl.sequences.reading import sequence_from_document
 from fitctl.sequences.view import SequenceError
 
 # A star in the middle of the field is found at once.
-NEAR = ("plant.loops.right.star_offset_sky_arcsec_max=5.0",)
+NEAR = ("plant.loops.right.star_offset_sky_arcsec_max=5.0", SOON)
 
 
 class MeddledLink(SimulatedLink):

@@ -6,7 +6,7 @@ import math
 import threading
 
 import pytest
-from instruments.simulated import failing
+from instruments.simulated import SOON, failing
 
 import fitctl
 from fitctl import AsyncInstrument, Instrument
@@ -16,7 +16,7 @@ from fitctl.sequences.methods import StepMethods
 from fitctl.sequences.reading import STEPS
 from fitctl.sequences.view import SequenceError
 
-NEAR = load_rig(default_rig_path(), ["plant.loops.right.star_offset_sky_arcsec_max=5.0"])
+NEAR = load_rig(default_rig_path(), ["plant.loops.right.star_offset_sky_arcsec_max=5.0", SOON])
 
 
 def mode(instrument):

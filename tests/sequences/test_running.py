@@ -115,7 +115,11 @@ def test_a_star_that_is_held_is_let_go_for_one_that_is_expected_elsewhere(tried)
 
 
 def test_a_step_that_takes_too_long_is_stopped_and_the_stages_are_held(tried):
-    run = tried("plant.loops.right.star_offset_sky_arcsec_max=200.0")
+    far, slow = (
+        "plant.loops.right.star_offset_sky_arcsec_max=200.0",
+        "loops.right.coarse.reach_fraction=0.05",
+    )
+    run = tried(far, slow)
 
     run({**ACQUIRE, "timeout_s": 1.0, "attempts": 1})
 

@@ -1,8 +1,10 @@
 """Another frame rate for a while: by command or for the learner, and always back to the rig file's."""
 
+import math
+
 import numpy as np
 import pytest
-from instruments.simulated import NEAR, SlowExecutor, events_of, failing, until
+from instruments.simulated import NEAR, SOON, SlowExecutor, events_of, failing, until
 from samples.learner_reports import report
 
 from fitctl.config import default_rig_path, load_rig
@@ -34,7 +36,7 @@ SILENT = DeviceTimeout("camera", "here", "an answer", "none")
 def held():
     """A rig that holds its star, and may act on what its learner reports; the test is its learner."""
     records = []
-    rig = load_rig(default_rig_path(), ["loops.right.learn=on"])
+    rig = load_rig(default_rig_path(), ["loops.right.learn=on", SOON])
     simulation = Simulation(rig, 0, record=records.append, **NEAR)
     simulation.records = records
     simulation.learners.clear()
@@ -87,17 +89,12 @@ def test_the_camera_runs_at_another_rate_for_a_while_and_the_star_is_held(held):
     assert max(abs(tick.error_az_px) for tick in held.ticks[-500:]) < 0.2
 
 
-@pytest.mark.parametrize(
-    ("values", "text"),
-    [
-        ({"rate_hz": 50.0}, "must be 45 to 49 Hz, got 50"),
-        ({"rate_hz": 20.0}, "must be 45 to 49 Hz, got 20"),
-        ({"rate_hz": float("nan")}, "must be 45 to 49 Hz, got nan"),
-        ({"rate_hz": 48.0, "duration_s": 600.0}, "duration_s must be 1 to 120, got 600"),
-    ],
-)
-def test_other_values_are_refused(held, values, text):
-    assert text in why_not(held, **values)
+def test_other_values_are_refused(held):
+    assert "must be 45 to 49 Hz, got 50" in why_not(held, rate_hz=50.0)
+    assert "must be 45 to 49 Hz, got 20" in why_not(held, rate_hz=20.0)
+    assert "must be 45 to 49 Hz, got nan" in why_not(held, rate_hz=math.nan)
+    too_long = why_not(held, rate_hz=48.0, duration_s=600.0)
+    assert "duration_s must be 1 to 120, got 600" in too_long
 
 
 def test_a_second_change_is_refused_until_the_first_has_ended(held):
@@ -258,12 +255,11 @@ def test_after_a_pause_the_learner_gets_its_rate_again(held):
     assert period_s(held) == pytest.approx(OTHER_S)
 
 
-@pytest.mark.parametrize("wish_hz", [0.0, 10.0, 50.0, float("nan")])
-def test_a_rate_that_cannot_be_is_no_wish(held, wish_hz):
-    assert held.command(report(worth_it=False, classifying_rate_hz=wish_hz)).accepted
-    held.run(2.0)
-
-    assert period_s(held) == pytest.approx(USUAL_S)
+def test_a_rate_that_cannot_be_is_no_wish(held):
+    for wish_hz in (0.0, 10.0, 50.0, math.nan):
+        assert held.command(report(worth_it=False, classifying_rate_hz=wish_hz)).accepted
+        held.run(2.0)
+        assert period_s(held) == pytest.approx(USUAL_S), wish_hz
 
 
 @pytest.mark.long

@@ -61,7 +61,7 @@ def changed(snapshot):
     return changed
 
 
-OFTEN_TESTED = {"VERNIER"}  # each mode takes seconds
+OFTEN_TESTED = {"VERNIER", "star_lost", "drive_fault", "faulty_testbed"}  # each takes seconds
 
 
 @pytest.mark.usefixtures("logs")
@@ -97,7 +97,13 @@ def test_dialog(changed, keys):
     assert changed(app, *keys, sizes=SMALL) == []
 
 
-@pytest.mark.parametrize("wrong", ALARMS)
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        pytest.param(wrong, marks=[] if wrong in OFTEN_TESTED else pytest.mark.long)
+        for wrong in ALARMS
+    ],
+)
 def test_alarm(changed, wrong):
     assert changed(FixedApp(ALARMS[wrong]())) == []
 

@@ -3,6 +3,7 @@
 from functools import partial
 
 import numpy as np
+from instruments.simulated import SOON
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.drivers.interface import DeviceFault, DeviceTimeout
@@ -22,7 +23,7 @@ class Bench:
 
     def __init__(self, *overrides, rig=None):
         self.records, self.buffer = [], TelemetryBuffer()
-        rig = rig or load_rig(default_rig_path(), overrides)
+        rig = rig or load_rig(default_rig_path(), [SOON, *overrides])
         self.simulation = Simulation(rig, 0, star_offset_px=(10.0, -6.0), record=self.take)
         self.supervisor, self.clock = self.simulation.supervisor, self.simulation.clock
         self.loop = self.supervisor.loops["right"]

@@ -12,7 +12,7 @@ def test_every_shipped_row_is_struck_here():
 
 
 @pytest.mark.parametrize("name", STRIKES)
-def test_a_shipped_row_trips_and_acts(name):
+def test_a_shipped_row_trips_acts_and_resets(name):
     bench = struck(name)
     trip, loop = bench.tripped[name], bench.loop
 
@@ -28,10 +28,10 @@ def test_a_shipped_row_trips_and_acts(name):
         bench.run(0.5)
         assert (*loop.mirror.stack_v, *loop.siderostat.setpoint_rad) == before
 
+    RESETS[trip.reset](bench, name)
 
-@pytest.mark.parametrize("name", [name for name, row in ROWS.items() if row.reset == "itself"])
-def test_a_shipped_row_resets_itself_once_its_cause_is_gone(name):
-    bench = struck(name)
+
+def resets_itself_once_its_cause_is_gone(bench, name):
     bench.run(0.5)
     assert name in bench.tripped
     bench.heal()
@@ -40,9 +40,7 @@ def test_a_shipped_row_resets_itself_once_its_cause_is_gone(name):
     assert bench.told(f"interlock {name} is over")
 
 
-@pytest.mark.parametrize("name", [name for name, row in ROWS.items() if row.reset == "hand"])
-def test_a_shipped_row_that_needs_a_hand_waits_for_it(name):
-    bench = struck(name)
+def waits_for_a_hand(bench, name):
     bench.heal()
     bench.run(5.0)
     assert name in bench.tripped
@@ -60,3 +58,6 @@ def test_a_shipped_row_that_needs_a_hand_waits_for_it(name):
         bench.run(3.0)
         assert not bench.tripped
         assert bench.loop.mode is Mode.STANDBY
+
+
+RESETS = {"itself": resets_itself_once_its_cause_is_gone, "hand": waits_for_a_hand}
