@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from instruments.simulated import SOON, SlowExecutor
+from instruments.simulated import SlowExecutor
 from samples.learner_reports import PAPER, SHAKEN, report
 
 from fitctl.config import default_rig_path, load_rig
@@ -34,7 +34,7 @@ class Night:
     """A rig that holds its star; the test is its learner."""
 
     def __init__(self, *overrides, learn="on"):
-        rig = load_rig(default_rig_path(), [SOON, *overrides, f"loops.right.learn={learn}"])
+        rig = load_rig(default_rig_path(), [*overrides, f"loops.right.learn={learn}"])
         self.records = []
         self.simulation = Simulation(rig, 1, record=self.records.append, history_s=60.0)
         self.simulation.learners.clear()

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from instruments.simulated import SOON, darken, mode_of, until
+from instruments.simulated import darken, mode_of, until
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.messages.commands import Acquire, Experiment, Release, Standby
@@ -19,7 +19,7 @@ CONTROLLER = "loops.right.vernier.controller={}"
 
 
 def rig_with(*overrides):
-    return load_rig(default_rig_path(), [SOON, *overrides])
+    return load_rig(default_rig_path(), overrides)
 
 
 @pytest.fixture
