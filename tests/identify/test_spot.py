@@ -95,7 +95,10 @@ def with_bad_pixels(rig, folder, bad):
 
 
 @pytest.mark.parametrize("reads_dn", [0, pytest.param(1000, marks=pytest.mark.long), 65535])
-@pytest.mark.parametrize("bad", [[(20, 20)], [(20, 20), (19, 22)]])
+@pytest.mark.parametrize(
+    "bad",
+    [[(20, 20)], pytest.param([(20, 21)], marks=pytest.mark.long), [(20, 20), (19, 22)]],
+)
 def test_bad_pixels_do_not_count(rig, tmp_path, bad, reads_dn):
     """The star's peak is in row 20, column 20."""
     rig = with_bad_pixels(rig, tmp_path, tuple(np.transpose(bad)))

@@ -35,7 +35,10 @@ def events(of):
     return [record.message for record in of.records if isinstance(record, Event)]
 
 
-@pytest.mark.parametrize("direction_deg", range(0, 360, 45))
+@pytest.mark.parametrize(
+    "direction_deg",
+    [pytest.param(deg, marks=[] if deg % 90 else pytest.mark.long) for deg in range(0, 360, 45)],
+)
 def test_a_beam_900_arcsec_off_is_found_and_held(direction_deg):
     angle = math.radians(direction_deg)
     one = bench(offset_arcsec=(900 * math.cos(angle), 900 * math.sin(angle)))

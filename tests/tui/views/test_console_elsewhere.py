@@ -161,7 +161,7 @@ def test_a_design_for_the_measured_light_is_evaluated_with_the_light_that_the_co
     "told_design",
     [
         {"controller": "/home/anna/mine.py"},
-        {"controller": "../../tmp/x.json"},
+        pytest.param({"controller": "../../tmp/x.json"}, marks=pytest.mark.long),
         {"controller": "--plot=x.png"},
         {"controller": "learnt", "learning": learning("{" + 60_000 * " ")},
     ],

@@ -82,7 +82,18 @@ def test_no_target_is_put_without_a_star(mode):
     assert sent(run(scenario, mode)) == []
 
 
-@pytest.mark.parametrize("mode", ["OFF", "STANDBY", "ACQUISITION", "COARSE", "VERNIER", "SAFE"])
+@pytest.mark.parametrize(
+    "mode",
+    [
+        "OFF",
+        "VERNIER",
+        "SAFE",
+        *(
+            pytest.param(mode, marks=pytest.mark.long)
+            for mode in ("STANDBY", "ACQUISITION", "COARSE")
+        ),
+    ],
+)
 def test_arrow_keys_move_nothing_unless_the_operator_has_taken_a_stage(mode):
     async def scenario(app, pilot):
         await pressed(app, pilot, "up", "down", "left", "right", "enter", "0")
