@@ -98,8 +98,7 @@ def measure(case: Case, duration_s: float) -> dict[str, Any]:
             for name in list(rig.loops)[: case.loops]
         }
         groups = servo_groups(devices, servos, clock)
-        # A property that can be set is an attribute to whoever runs it.
-        work: list[Periodic] = list(groups) or list(servos.values())  # pyrefly: ignore[bad-assignment]
+        work: list[Periodic] = list(groups) or list(servos.values())
         threads = [PeriodicThread(each, clock) for each in work]
         for thread in threads:
             thread.start()

@@ -1,5 +1,6 @@
 """What fitctl imports is what its package requires."""
 
+import ast
 import re
 import sys
 import tomllib
@@ -7,16 +8,17 @@ from importlib.metadata import packages_distributions
 from pathlib import Path
 
 ROOT = Path(__file__).parent.parent
-# To parse every file takes seconds. An `import` names one module, not several (ruff, E401).
-_IMPORT = re.compile(r"^ *(?:import (\w+)|from (\w+)[\w.]* import )", re.MULTILINE)
 _NAME = re.compile(r"[\w.-]+")
 
 
 def imported():
     """Top-level modules of others that fitctl's code names."""
     for path in (ROOT / "fitctl").rglob("*.py"):
-        for module, package in _IMPORT.findall(path.read_text()):
-            yield module or package
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                yield from (alias.name.partition(".")[0] for alias in node.names)
+            elif isinstance(node, ast.ImportFrom) and node.level == 0:
+                yield node.module.partition(".")[0]
 
 
 def normal(name):

@@ -14,9 +14,23 @@ class Periodic(Protocol):
     """What wants to be run at a pace of its own."""
 
     period_s: float
-    threaded: bool
     late_s: deque[float]
-    skipped: int
+
+    @property
+    def threaded(self) -> bool:
+        """A thread runs it, and no request does so by itself."""
+        ...
+
+    @threaded.setter
+    def threaded(self, threaded: bool) -> None: ...
+
+    @property
+    def skipped(self) -> int:
+        """Periods that were too late."""
+        ...
+
+    @skipped.setter
+    def skipped(self, skipped: int) -> None: ...
 
     def period(self) -> None:
         """Do one period's work."""

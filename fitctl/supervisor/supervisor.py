@@ -257,9 +257,7 @@ class Supervisor:
         drives = [] if self.collector is None else [self.collector.drive]
         grouped = [servo for group in self._servo_groups for servo in group.servos]
         each = [work for loop in self.loops.values() for work in loop.periodic]
-        alone = [work for work in each if work not in grouped]
-        # A property that can be set is an attribute to whoever runs it.
-        return [*self._servo_groups, *alone, *drives]  # pyrefly: ignore[bad-return]
+        return [*self._servo_groups, *(work for work in each if work not in grouped), *drives]
 
     @property
     def places(self) -> list[Place]:

@@ -24,7 +24,7 @@ _GIVEN = set()
 
 
 def free_port():
-    """A port of TCP that nobody has now and no earlier call gave: the kernel may name one twice."""
+    """A free TCP port, and never one that an earlier call returned: the kernel may offer it again."""
     while True:
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))

@@ -7,6 +7,7 @@ from fitctl.simulation.devices import InlineExecutor
 
 NEAR = {"star_offset_px": (10.0, -6.0)}
 SOON = "loops.right.coarse.reach_fraction=0.7"  # seconds less in COARSE
+AS_SHIPPED = "loops.right.coarse.reach_fraction=0.05"  # the mirror is near its bias in VERNIER
 TWO_STARS = (
     "plant.loops.right.spots=[{name='a', offset_px={az=0.0, el=0.0}, flux_dn=30000.0, diameter_px=3.0}, "
     "{name='b', offset_px={az=-9.0, el=5.0}, flux_dn=24000.0, diameter_px=3.0}]"

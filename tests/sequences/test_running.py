@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from instruments.simulated import AS_SHIPPED
 from sequence_runs import run_sequence
 
 from fitctl.config import default_rig_path, load_rig
@@ -15,7 +16,6 @@ from fitctl.sequences.links import SimulatedLink
 from fitctl.sequences.reading import load_sequence
 
 ACQUIRE = {"step": "acquire"}
-AS_SHIPPED = "loops.right.coarse.reach_fraction=0.05"  # not SOON: the siderostat does most
 HOLD = {"step": "hold", "duration_s": 5.0, "settle_s": 5.0}
 RIG = load_rig(default_rig_path())
 RIGS = default_rig_path().parent

@@ -10,12 +10,12 @@ import pytest
 from fitctl.config import default_rig_path, load_rig
 from fitctl.logging.reading import read_records
 from fitctl.messages.commands import SetTarget, Shutdown, Stop
+from tests.instruments.simulated import SOON
 from tests.samples.logged_simulation import LoggedSimulation
 
 from .conftest import NEAR, end, running
 
 FRAMES = "/fit/camera/frame"
-SOON = "loops.right.coarse.reach_fraction=0.7"
 
 
 def replayed(log):

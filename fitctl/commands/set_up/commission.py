@@ -107,7 +107,7 @@ def commission(
         tuple(overrides or ()),
         files,
         load(files.record, settings.name),
-        _reporter(silent=as_json and yes),  # who is asked must see what moves
+        _reporter(silent=as_json and yes),  # an operator who answers questions must see what moves
         quick,
         _by_hand if real or not (yes or console_pid) else partial(_by_bench, settings),
     )

@@ -6,6 +6,7 @@ import timeit
 import numpy as np
 import pytest
 from instruments.served import until
+from instruments.simulated import AS_SHIPPED
 from interlock_bench import Bench, late_frames, servo_that_skips, struck
 
 from fitctl.config import QUANTITIES
@@ -30,7 +31,7 @@ def with_action(action, reset="hand", modes="['VERNIER']"):
     """The frame-age row with another action; the mirror takes over as shipped, near its bias."""
     fields = {"action": action, "reset": reset, "modes": modes}
     row = (f"interlocks.frame_age.{key}={value}" for key, value in fields.items())
-    return Bench("loops.right.coarse.reach_fraction=0.05", *row)
+    return Bench(AS_SHIPPED, *row)
 
 
 @pytest.mark.long
