@@ -33,6 +33,9 @@ _RIG_WEIGHTS = (8, 3, 2, 3, 3)
 OPERATORS = ("ada", "ben", "cleo", "dora")
 _OF_ONE_LOOP = 0.3  # fraction of commands that name a loop
 _WITHOUT_FAULTS = 0.15  # fraction of runs without device faults
+# Fraction of calm runs, whose loops hold their stars between happenings: with several loops, few others do so.
+# How often something happens then, and which fraction of it are faults and the like.
+_CALM, _CALM_OF_SEVERAL, _CALM_EVERY_S, _CALM_FAULTS = 0.2, 0.6, (8.0, 25.0), 0.8
 _CONSOLE_SLOW = 0.2  # fraction of runs whose console misses messages
 _REMOTE = 0.1  # fraction of runs with remote consoles: decoding takes a fifth of their time
 # Of sequences. Each of them begins at a star that is held, or is refused.
@@ -48,10 +51,8 @@ _STEPS = (
     "controller",
     "off",
 )
-_OF_A_LOOP, _OF_ANYBODY = (
-    0.9,
-    0.1,
-)  # fractions of sequences: for one loop; of a viewer, too, who is refused
+# Fractions of sequences: for one loop; of a viewer, too, who is refused.
+_OF_A_LOOP, _OF_ANYBODY = 0.9, 0.1
 _CALIBRATING = ("experiment", "chirp", "plate_scale", "standby dark")
 _OF_TESTBED = (
     "reference collector",
@@ -90,6 +91,9 @@ _LOOP_FAILS = 0.3  # fraction of these in which a loop fails, in place of a stop
 _LOOSE = 0.4  # fraction of the testbed's runs in which photodiodes come loose,
 _LOOSE_S = 0.2, 3.0  # and for how long
 _REFERENCED_S = 7.0  # until a reference move has ended
+# Fraction of the testbed's runs in which something meets the loop that waits for its link; which loop that is,
+# and how long the link is away.
+_AWAY, _WAITS, _AWAY_S = 0.5, "left", (0.5, 8.0)
 _BURST, _BURST_S = 0.4, 0.05  # fraction of happenings that follow another at once, and mean delay
 
 
@@ -256,6 +260,7 @@ _MEETS_EXPERIMENT = (
     "shutdown",
 )
 """Commands that come while an experiment is under way; see `COMMANDS`."""
+_MEETS_WAITING = (*_MEETS_EXPERIMENT, "jog", "bias-offset", "standby", "recover", "stall", "kill")
 
 
 def plan_of(seed: int) -> Plan:
@@ -269,7 +274,8 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
     """A plan for a rig.
 
     Each run draws a few kinds of faults and commands, leaves out the others, and has its own pace. A defect
-    that many faults at once would hide shows in a run that has few of them.
+    that many faults at once would hide shows in a run that has few of them. In calm runs, happenings and the
+    faults that last meet loops that hold their stars.
     """
     loops = RIGS[rig]
     fast = random.random() < FAST.get(rig, 0.0)
@@ -277,9 +283,11 @@ def drawn_plan(random: Random, seed: int, rig: str) -> Plan:
     words = random.sample(list(COMMANDS), random.randint(1, len(COMMANDS)))
     strikes = _drawn_strikes(random, rig)
     every_s, fault_part = 10 ** random.uniform(-0.3, 1.0), random.uniform(0.05, 0.6)
+    attend_s = 10 ** random.uniform(0.0, 1.3)
+    if random.random() < (_CALM_OF_SEVERAL if len(loops) > 1 else _CALM):
+        every_s, fault_part, attend_s = random.uniform(*_CALM_EVERY_S), _CALM_FAULTS, 1.0
     # The service refuses commands from operators without the lease.
     people = OPERATORS[: random.randint(1, len(OPERATORS))]
-    attend_s = 10 ** random.uniform(0.0, 1.3)
     happenings: list[Happening] = []
     at_s = 0.1
     while at_s < duration_s:  # the first operator keeps trying to hold the star
@@ -357,6 +365,8 @@ def _drawn_strikes(random: Random, rig: str) -> list[Callable[[Random, float], l
         strikes.append(partial(_jogged_to_the_end, loops=loops))
     if "metrology" in loops and random.random() < _COLLECTOR:
         strikes += [partial(_moved_collector, loops=loops)] * random.randint(1, 2)
+    if "metrology" in loops and random.random() < _AWAY:
+        strikes += [_met_waiting] * random.randint(1, 3)
     return strikes
 
 
@@ -514,6 +524,36 @@ def _met_experiment(
         Order(at_s=at_s, who=who, command=experiment),
         *meets,
     ]
+
+
+def _met_waiting(random: Random, at_s: float) -> list[Happening]:
+    """The link is away for a while, and something meets the loop that waits for it.
+
+    That is up to three commands, most of them experiments, a stall, or a kill of the supervisor.
+    """
+    who, lasts_s = OPERATORS[0], random.uniform(*_AWAY_S)
+    device = random.choice(("metrology photodiodes", "metrology siderostat"))
+    gone = (
+        Strike(at_s=at_s, device=device, fault=random.choice(FAULTS[1:]), lasts_s=lasts_s),
+        Order(at_s=at_s, who=who, command=Release(loop="metrology")),
+    )
+    happenings: list[Happening] = [
+        Order(at_s=at_s, who=who, command=TakeOver()),
+        random.choice(gone),
+    ]
+    for _ in range(random.randint(1, 3)):
+        meets_s = at_s + random.uniform(0.0, lasts_s)
+        what = random.choice(("experiment", random.choice(_MEETS_WAITING)))
+        if what == "stall":
+            happenings += _stall(random, meets_s)
+        elif what == "kill":
+            happenings += _kill(random, meets_s)
+        else:
+            command = COMMANDS[what](random)
+            if command is not None:
+                command = msgspec.structs.replace(command, loop=_WAITS)
+            happenings.append(Order(at_s=meets_s, who=who, command=command))
+    return happenings
 
 
 def _moved_collector(random: Random, at_s: float, loops: tuple[str, ...]) -> list[Happening]:

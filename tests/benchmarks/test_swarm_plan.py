@@ -1,5 +1,6 @@
 """What the draw of a plan has: rigs, settings, happenings."""
 
+from itertools import pairwise
 from random import Random
 from typing import get_args
 
@@ -35,9 +36,16 @@ from benchmarks.swarm.rigs import (
 )
 from fitctl.config import ConfigError, load_rig
 from fitctl.controllers.design.choose import design_for
-from fitctl.messages.commands import AnyCommand, RecorderReport, SequenceReport
+from fitctl.messages.commands import (
+    AnyCommand,
+    Experiment,
+    RecorderReport,
+    Release,
+    SequenceReport,
+)
 
 VIBRATION = vibration(20.0, 0.3, 180.0)
+LINK = {"metrology photodiodes", "metrology siderostat"}
 KINDS = {kind_of(device) for device in devices_of("fit-testbed.toml")}
 
 
@@ -118,6 +126,39 @@ def test_plans_have_every_kind_of_happening():
     assert struck == of_lines | wrong | {("siderostat", "power cut")}
     kinds = {happening.kind for happening in happenings}
     assert {"D/A mute", "D/A mute at times", "D/A mute once", "stall of the supervisor"} <= kinds
+
+
+def test_in_most_plans_of_the_testbed_its_loops_have_time_to_hold_their_stars():
+    """Between what happens there are at least 10 s, in more than half of the time."""
+    times = []
+    for seed in range(100):
+        happenings = drawn_plan(Random(seed), seed, "fit-testbed.toml").happenings
+        met_s = [each.at_s for each in happenings if each.kind not in {"onwards", "LearnerReport"}]
+        pauses_s = [after - before for before, after in pairwise([0.0, *met_s, DURATION_S])]
+        times.append(sum(pause_s for pause_s in pauses_s if pause_s >= 10.0))
+
+    assert 40 < sum(time_s > DURATION_S / 2 for time_s in times) < 80
+
+
+def test_many_experiments_meet_the_loop_that_waits_for_its_link():
+    met = 0
+    for seed in range(50):
+        happenings = drawn_plan(Random(seed), seed, "fit-testbed.toml").happenings
+        away_s = [
+            happening.at_s
+            for happening in happenings
+            if (isinstance(happening, Order) and happening.command == Release(loop="metrology"))
+            or (isinstance(happening, Strike) and happening.device in LINK)
+        ]
+        met += sum(
+            isinstance(happening, Order)
+            and isinstance(happening.command, Experiment)
+            and happening.command.loop == "left"
+            and any(0.0 < happening.at_s - at_s < 8.0 for at_s in away_s)
+            for happening in happenings
+        )
+
+    assert met > 50
 
 
 def test_plans_have_every_command_that_people_and_the_learner_give():
