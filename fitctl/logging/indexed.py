@@ -6,7 +6,6 @@ wants ticks would wait most of the time for those.
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -17,15 +16,11 @@ from mcap.reader import SeekingReader
 from mcap.records import Channel, Chunk, Message, Schema
 from mcap.stream_reader import get_chunk_data_stream
 
-_RECORD = struct.Struct("<BQ")  # opcode, length of what follows
-_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; then its data
+from fitctl.logging.chunks import MESSAGE, RECORD, records
 
 
 class IndexedReader(SeekingReader):
-    """The library's reader, which passes over what is not wanted within a chunk too.
-
-    (MCAP specification, "Records" and "Message".)
-    """
+    """The library's reader, which passes over what is not wanted within a chunk too."""
 
     def iter_messages(
         self, topics: Iterable[str] | str | None = None, *args: Any, **options: Any
@@ -50,18 +45,16 @@ class IndexedReader(SeekingReader):
             inside = index.message_index_offsets
             if inside and wanted.keys().isdisjoint(inside):
                 continue
-            self._stream.seek(index.chunk_start_offset + _RECORD.size)
+            self._stream.seek(index.chunk_start_offset + RECORD.size)
             chunk = Chunk.read(ReadDataStream(self._stream))
             stream, length = get_chunk_data_stream(chunk, validate_crc=self._validate_crcs)
-            content, at = stream.read(length), 0
-            while at < length:
-                opcode, size = _RECORD.unpack_from(content, at)
-                begin, at = at + _RECORD.size, at + _RECORD.size + size
+            content = stream.read(length)
+            for opcode, begin, end in records(content):
                 if opcode != Opcode.MESSAGE:
                     continue
-                number, sequence, log_time, publish_time = _MESSAGE.unpack_from(content, begin)
+                number, sequence, log_time, publish_time = MESSAGE.unpack_from(content, begin)
                 if number in wanted:
-                    data = content[begin + _MESSAGE.size : at]
+                    data = content[begin + MESSAGE.size : end]
                     yield *wanted[number], Message(number, log_time, data, publish_time, sequence)
                 elif number not in summary.channels:
                     msg = f"a message is of channel {number}, which the index does not know"

@@ -21,6 +21,7 @@ from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
 from mcap_protobuf.decoder import DecoderFactory
 
+from fitctl.logging.chunks import MESSAGE, RECORD, records
 from fitctl.logging.errors import LogError
 from fitctl.logging.files import DAMAGE, Described, opened
 from fitctl.logging.reading import LogMessage
@@ -28,10 +29,8 @@ from fitctl.logging.reading import LogMessage
 MOST_CHUNKS = 1_000_000
 MOST_METADATA_BYTES = 128 << 20
 MOST_BYTES_AT_ONCE = 256 << 20  # that one call unpacks
-_RECORD = struct.Struct("<BQ")  # opcode, length of what follows
 _TIMES = struct.Struct("<QQ")  # of a chunk's first and last message
 _CHANNEL = struct.Struct("<H")  # that a message index is of
-_MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time; then its data
 
 
 class _ChunkPlace(NamedTuple):
@@ -142,10 +141,10 @@ class SeekableLog:
         unpacked: _ChunkPlace | None = None
         while True:
             stream.seek(at)
-            head = stream.read(_RECORD.size)
-            if len(head) < _RECORD.size:
+            head = stream.read(RECORD.size)
+            if len(head) < RECORD.size:
                 return
-            opcode, size = _RECORD.unpack(head)
+            opcode, size = RECORD.unpack(head)
             if opcode in {Opcode.CHUNK_INDEX, Opcode.FOOTER}:
                 return  # all channels of a finished log come before the index
             if opcode == Opcode.CHUNK:
@@ -168,10 +167,10 @@ class SeekableLog:
                 metadata_bytes += size
                 entry = Metadata.read(ReadDataStream(io.BytesIO(stream.read(size))))
                 self.metadata[entry.name] = entry.metadata
-            at += _RECORD.size + size
+            at += RECORD.size + size
 
     def _learn_channels(self, content: bytes) -> None:
-        for opcode, begin, end in _records(content):
+        for opcode, begin, end in records(content):
             if opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
                 part = ReadDataStream(io.BytesIO(content[begin:end]))
                 if opcode == Opcode.SCHEMA:
@@ -185,7 +184,7 @@ class SeekableLog:
         if place.size > MOST_BYTES_AT_ONCE:
             msg = f"a chunk of {place.size} bytes"
             raise McapError(msg)
-        stream.seek(place.offset + _RECORD.size)
+        stream.seek(place.offset + RECORD.size)
         chunk = Chunk.read(ReadDataStream(io.BytesIO(stream.read(place.size))))
         content, length = get_chunk_data_stream(chunk, validate_crc=True)
         return content.read(length)
@@ -194,15 +193,15 @@ class SeekableLog:
         self, content: bytes, from_ns: int, to_ns: int, wanted: Mapping[int, str]
     ) -> Iterator[LogMessage]:
         try:
-            for opcode, begin, end in _records(content):
+            for opcode, begin, end in records(content):
                 if opcode != Opcode.MESSAGE:
                     continue
-                number, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(content, begin)
+                number, sequence, log_ns, publish_ns = MESSAGE.unpack_from(content, begin)
                 if number not in wanted or not from_ns <= log_ns <= to_ns:
                     continue
                 decode = self._decoder(number)
                 if decode is not None:
-                    message = decode(content[begin + _MESSAGE.size : end])
+                    message = decode(content[begin + MESSAGE.size : end])
                     yield LogMessage(wanted[number], message, log_ns, publish_ns, sequence)
         except DAMAGE:
             self.damaged += 1
@@ -214,12 +213,3 @@ class SeekableLog:
             schema = self._schemas.get(channel.schema_id)
             self._decoders[number] = self._factory.decoder_for(channel.message_encoding, schema)
         return self._decoders[number]
-
-
-def _records(content: bytes) -> Iterator[tuple[int, int, int]]:
-    """Opcode of each record of a chunk, and where the record's own part begins and ends."""
-    at = 0
-    while at < len(content):
-        opcode, size = _RECORD.unpack_from(content, at)
-        begin, at = at + _RECORD.size, at + _RECORD.size + size
-        yield opcode, begin, at
