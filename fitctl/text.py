@@ -34,6 +34,17 @@ def _escaped(character: str) -> str:
     return "".join(f"\\u{units[at]:02x}{units[at + 1]:02x}" for at in range(0, len(units), 2))
 
 
+def json_bytes(value: Any) -> bytes:
+    """JSON; what is not a number becomes null.
+
+    Surrogates, which the name of a file has where it is not UTF-8, become visible as :func:`plain` shows them.
+    """
+    try:
+        return msgspec.json.encode(value)
+    except UnicodeEncodeError:
+        return msgspec.json.encode(plain_message(msgspec.to_builtins(value, str_keys=True)))
+
+
 def plain_message(value: _T) -> _T:
     """A decoded message whose texts have all gone through :func:`plain`, however deep they are."""
     return _plain(value)

@@ -8,7 +8,7 @@ from typing import Any
 
 import msgspec
 
-from fitctl.text import plain
+from fitctl.text import json_bytes, plain
 
 
 def write_page(path: Path, package: str, template: str, **values: Any) -> None:
@@ -55,4 +55,4 @@ def write_json(path: Path, value: dict[str, Any]) -> None:
     OSError
         If it cannot be written.
     """
-    path.write_bytes(msgspec.json.format(msgspec.json.encode(value), indent=2) + b"\n")
+    path.write_bytes(msgspec.json.format(json_bytes(value), indent=2) + b"\n")

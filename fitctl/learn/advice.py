@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fitctl.config import ConfigError
 from fitctl.controllers.design.basis import Basis, Line
 from fitctl.controllers.design.linear_loop.bound import bound, linear_residual
 from fitctl.controllers.design.linear_loop.loopshape import sampled_response
@@ -371,14 +372,22 @@ def advise(
     Raises
     ------
     ConfigError
-        If there is too little of it, or no design has the margins.
+        If there is too little of it, no design has the margins, or the present one would be unstable.
     """
     night, truth, classified = estimated(series, rig_basis, known, others)
     true_hz = dict(classified)
     suspects = tuple(line for line in truth.lines if can_be_alias(line, truth))
     present_stands = standing(present, truth)
-    gain = gain_for_aliases(night)
-    shown = dataclasses.replace(truth, mirror_gain=min(truth.mirror_gain, shown_gain(night)))
+    if math.isinf(present_stands.residual_px):
+        msg = (
+            f"learn: the mirror moves by {night.mirror_gain} of what the rig file predicts, and the "
+            "design in force would be unstable with that; measure it with fitctl identify hysteresis"
+        )
+        raise ConfigError(msg)
+    gain, less = gain_for_aliases(night), shown_gain(night)
+    shown = truth
+    if less < 1:
+        shown = dataclasses.replace(truth, mirror_gain=min(truth.mirror_gain, less))
     for parts in safe_parts(truth, present, gain):
         design = design_with_margins(expecting(parts, truth), required, like)
         learnt_stands = standing(design, truth)

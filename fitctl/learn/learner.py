@@ -200,12 +200,6 @@ class Learner:
             for one in self._classified
             if all(abs(one.frequency_hz - hz) > SAME_LINE_HZ for hz in found)
         ]
-        if math.isinf(advice.present.residual_px):
-            msg = (
-                f"learn: the mirror moves by {advice.night.mirror_gain} of what the rig file predicts, and the "
-                "design in force would be unstable with that; measure it with fitctl identify hysteresis"
-            )
-            raise ConfigError(msg)
         return advice
 
     def _report(self, advice: Advice) -> LearnerReport:

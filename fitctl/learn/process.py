@@ -89,7 +89,9 @@ class LoopLearner:
 def serve_learning(client: Client, rig: Rig, stop: threading.Event) -> None:
     """Learn from a supervisor's telemetry until `stop`."""
     give_way(NICENESS)
-    resource.setrlimit(resource.RLIMIT_DATA, (MOST_BYTES, MOST_BYTES))
+    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    most = MOST_BYTES if hard == resource.RLIM_INFINITY else min(MOST_BYTES, hard)
+    resource.setrlimit(resource.RLIMIT_DATA, (most, most))
     learners = {
         name: LoopLearner(rig, name)
         for name, loop in rig.stellar_loops.items()

@@ -25,6 +25,7 @@ from fitctl.files import replaced_whole
 from fitctl.logging.errors import LogError
 from fitctl.logging.files import COPY, DAMAGE, RECOVERED, Described, opened
 from fitctl.logging.folder import in_use
+from fitctl.text import plain
 
 # A recorder that dies leaves a quarter of logging.queue_records unconfirmed, and that is a million at the most.
 _REMEMBERED = 250_000
@@ -225,7 +226,7 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
         If there is nothing to save, the source is no log, or the target exists or cannot be written.
     """
     reading, writing = _Source(source), _Target(target, overwrite=overwrite)
-    with writing.writing(**{RECOVERED: source.name}):
+    with writing.writing(**{RECOVERED: plain(source.name)}):
         for entry in reading.entries():
             writing.add(entry)
         if not writing.records:

@@ -21,7 +21,11 @@ from fitctl.logging.records import Event, FrameRecord
 from fitctl.logging.schemas import TOPICS
 
 _ROWS = 5000  # of one topic in memory at a time
-_RENAMED = {"name": "source", "width": "width_px", "height": "height_px", "frame_id": "camera"}
+# Columns of Foxglove's messages, by topic, as fitctl's own records name them.
+_RENAMED = {
+    TOPICS[Event]: {"name": "source"},
+    TOPICS[FrameRecord]: {"width": "width_px", "height": "height_px", "frame_id": "camera"},
+}
 
 Write = Callable[[Columns], None]
 
@@ -111,7 +115,8 @@ def _blocks(path: Path, topics: list[str], *, frames: bool) -> Iterator[tuple[st
                 del columns["file"], columns["line"]
         except (KeyError, TypeError, ValueError) as error:
             raise _foreign(f"{path}: {topic}", error) from None
-        yield topic, {_RENAMED.get(name, name): column for name, column in columns.items()}
+        renamed = _RENAMED.get(topic, {})
+        yield topic, {renamed.get(name, name): column for name, column in columns.items()}
 
 
 def _foreign(what: str, error: Exception) -> LogError:

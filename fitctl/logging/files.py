@@ -40,7 +40,7 @@ MEND = "`fitctl log recover` saves what is sound into a new file"
 COPY = "copy"
 """Name of the metadata that a log has which was made from others."""
 RECOVERED = "recovered"
-"""In that metadata, the name of the file that such a log was recovered from."""
+"""In that metadata, the name of the file that such a log was recovered from, as `fitctl.text.plain` has it."""
 
 
 # A chunk is logging.chunk_bytes and a record, at most; a few kilobytes can unpack to gigabytes.

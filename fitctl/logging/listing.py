@@ -9,6 +9,7 @@ from typing import NamedTuple
 from fitctl.logging.errors import LogError, NoLogError
 from fitctl.logging.files import COPY, RECOVERED
 from fitctl.logging.reading import LogInfo, log_info
+from fitctl.text import plain
 
 
 def logs_in(folder: Path) -> tuple[list[LogInfo], dict[Path, LogError]]:
@@ -82,12 +83,12 @@ def find_newest(folder: Path, rig: str | None = None) -> NewestRun:
         for log in readable
         if log.counts and log.runs <= 1 and "rig" in log.metadata and rig in {None, rig_name(log)}
     ]
-    saved = {_recovered_from(log) for log in readable} & {path.name for path in problems}
+    saved = {_recovered_from(log) for log in readable} & {plain(path.name) for path in problems}
     run = [log for log in logs if run_of(log) == run_of(logs[-1])]
     files = [log.path for log in _without_copies(run, saved)]
     last_s = max(map(_written_s, files), default=math.inf)
     for path, problem in problems.items():
-        may_be_newest = _written_s(path) > last_s and path.name not in saved
+        may_be_newest = _written_s(path) > last_s and plain(path.name) not in saved
         if may_be_newest and not isinstance(problem, NoLogError):
             msg = f"{problem}. It was written after {files[-1]}, so the newest run may be in it; name a LOG"
             raise LogError(msg)
@@ -111,4 +112,4 @@ def _without_copies(run: list[LogInfo], saved: set[str]) -> list[LogInfo]:
 
 
 def _recovered_from(log: LogInfo) -> str:
-    return log.metadata.get(COPY, {}).get(RECOVERED, "")
+    return plain(log.metadata.get(COPY, {}).get(RECOVERED, ""))

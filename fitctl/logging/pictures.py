@@ -90,6 +90,17 @@ class LoggedPictures:
 
     def _picture(self, entry: LogMessage) -> _Picture:
         frame: Any = entry.message
+        try:
+            image = self._image(frame)
+        except (AttributeError, TypeError) as error:
+            msg = (
+                f"{self._path}: {_TOPIC} has messages of type {frame.DESCRIPTOR.full_name}, which another "
+                "program wrote; name a log that a camera's frames went into"
+            )
+            raise LogError(msg) from error
+        return _Picture(entry.publish_time_ns, image)
+
+    def _image(self, frame: Any) -> NDArray[np.uint16]:
         if (frame.height, frame.width) != self._shape:
             height_px, width_px = self._shape
             msg = (
@@ -100,6 +111,4 @@ class LoggedPictures:
         if len(frame.data) != 2 * frame.height * frame.width:
             msg = f"{self._path}: has a frame of {len(frame.data)} bytes, which are not two for each pixel"
             raise LogError(msg)
-        return _Picture(
-            entry.publish_time_ns, np.frombuffer(frame.data, "<u2").reshape(self._shape)
-        )
+        return np.frombuffer(frame.data, "<u2").reshape(self._shape)

@@ -43,6 +43,7 @@ _COLUMNS: dict[int, tuple[str, Any]] = {
     FieldDescriptor.CPPTYPE_STRING: ("", np.str_),
 }
 _MOST_CHARACTERS = 200_000_000  # of a column of texts, of four bytes each
+_BLOCK_CHARACTERS = 5_000_000  # likewise, with which a block of few rows is large enough
 Columns = dict[str, NDArray[Any]]
 HEADER = ("log_time_ns", "publish_time_ns", "sequence")
 """The columns that every topic has."""
@@ -183,6 +184,7 @@ def column_blocks(
     topics : collection of str, optional
         All, unless named.
     rows : int, optional
+        Where texts are long, a block has fewer.
     fields : mapping of str to collection of str, optional
         Of a topic that is named here only these of its fields: the others cost time and room.
 
@@ -225,7 +227,7 @@ def column_blocks(
                 "expected nanoseconds since 1970: `fitctl log cut` leaves such records out with --to"
             )
             raise LogError(msg) from None
-        if len(block) >= rows:
+        if len(block) >= rows or (rows < math.inf and block.characters > _BLOCK_CHARACTERS):
             yield entry.topic, block.columns(f"{path}: {entry.topic}")
             del blocks[entry.topic]
     for topic, block in blocks.items():
@@ -282,9 +284,16 @@ class _Block:
         }
         self._header = [self._values[name] for name in HEADER]
         self._fields = [(name, self._values[name]) for name in form]
+        self._texts = [self._values[name] for name in form if self._dtypes[name] is np.str_]
+        self._longest = 0
 
     def __len__(self) -> int:
         return len(self._header[0])
+
+    @property
+    def characters(self) -> int:
+        """Room for the longest text in every row."""
+        return self._longest * len(self)
 
     def add(self, entry: LogMessage) -> None:
         times_ns = (entry.log_time_ns, entry.publish_time_ns, entry.sequence)
@@ -292,6 +301,8 @@ class _Block:
             column.append(value)
         for name, column in self._fields:
             column.append(getattr(entry.message, name))
+        for column in self._texts:
+            self._longest = max(self._longest, len(column[-1]))
 
     def columns(self, what: str) -> Columns:
         """Its columns; an array of texts has room for the longest one in every row."""
@@ -428,6 +439,11 @@ def _read_index(
     statistics = summary.statistics
     for channel, number in statistics.channel_message_counts.items():
         counts[summary.channels[channel].topic] += number
+    if statistics.message_count != counts.total():
+        msg = (
+            f"its index counts {statistics.message_count} messages, and {counts.total()} by channel"
+        )
+        raise McapError(msg)
     described += reader.iter_metadata()
     if not statistics.message_count:
         return []

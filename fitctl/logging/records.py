@@ -341,7 +341,7 @@ class PiezoReading(Record, frozen=True, kw_only=True):
 
 
 class LoopTiming(Record, frozen=True, kw_only=True):
-    """Timing over the last second: frame loop and position servo."""
+    """Timing over the last second: frame loop and position servo; frames lost since the camera was opened."""
 
     loop: str
     ticks: int

@@ -67,6 +67,7 @@ def verify(path: Path) -> Verdict:
     counts: Counter[str] = Counter()
     lost = last_lost = frames_missing = newest_ns = misdated = 0
     first_misdated = ""
+    foreign: dict[str, str] = {}
     last_frame: int | None = None
     try:
         info = log_info(path)
@@ -80,18 +81,27 @@ def verify(path: Path) -> Verdict:
             if not first_s <= entry.publish_time_ns / 1e9 <= last_s:
                 misdated += 1
                 first_misdated = first_misdated or f"record {counts.total()} ({entry.topic})"
-            if entry.topic == TOPICS[RecorderStatus]:
-                now_lost = message.lost  # counts on while one recorder lives
-                lost += now_lost - last_lost if now_lost >= last_lost else now_lost
-                last_lost = now_lost
-            elif entry.topic == TOPICS[FrameRecord]:
-                if last_frame is not None:  # the camera's numbers begin anew at times
-                    frames_missing += max(0, entry.sequence - last_frame - 1)
-                last_frame = entry.sequence
-                if len(message.data) != message.step * message.height:
-                    problems.append(
-                        f"frame {entry.sequence}: the size of its data does not match its header"
-                    )
+            try:
+                if entry.topic == TOPICS[RecorderStatus]:
+                    now_lost = message.lost  # counts on while one recorder lives
+                    lost += now_lost - last_lost if now_lost >= last_lost else now_lost
+                    last_lost = now_lost
+                elif entry.topic == TOPICS[FrameRecord]:
+                    # The camera's numbers begin anew at times.
+                    before = entry.sequence if last_frame is None else last_frame
+                    frames_missing += max(0, entry.sequence - before - 1)
+                    last_frame = entry.sequence
+                    if len(message.data) != message.step * message.height:
+                        problems.append(
+                            f"frame {entry.sequence}: the size of its data does not match its header"
+                        )
+            except (AttributeError, TypeError):  # a message of another program, with other fields
+                foreign[entry.topic] = message.DESCRIPTOR.full_name
+        problems += [
+            f"{topic}: has messages of type {kind}, whose fields are not those that fitctl records; another "
+            "program wrote them, and nothing is counted of them"
+            for topic, kind in foreign.items()
+        ]
         if misdated:
             problems.append(
                 f"{first_misdated}: its own time is more than a day outside the log's; {misdated} records are "

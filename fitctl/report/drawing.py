@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -218,7 +219,9 @@ def draw(plot: Plot, folder: Path) -> str:
     figure = plot.figure
     if figure is None:
         return ""
-    with matplotlib.rc_context({"svg.hashsalt": plot.stem}):
+    with matplotlib.rc_context({"svg.hashsalt": plot.stem}), warnings.catch_warnings():
+        # A name may be in any writing; in an SVG the reader's own fonts show it.
+        warnings.filterwarnings("ignore", r"Glyph \d+ .* missing from", UserWarning)
         figure.savefig(folder / f"{plot.stem}.png", dpi=_DPI, metadata={"Software": None})
         figure.set_layout_engine("none")  # it is laid out: once is slow enough
         text = io.StringIO()

@@ -15,7 +15,7 @@ from fitctl.logging.reading import Columns
 from fitctl.messages.modes import Mode
 from fitctl.model.optics import scales
 from fitctl.report.fringes import FringeFindings, find_fringes
-from fitctl.report.gather import Gathered, gather
+from fitctl.report.gather import Gathered, counted, gather
 from fitctl.report.rejection import Held, Rejection, held_by_controller, rejections
 from fitctl.report.residual import Estimate, Verdict, Word, night_verdict, rms_estimate, verdict
 from fitctl.report.run import Run
@@ -224,10 +224,11 @@ def _mode_s(ticks: Columns, period_s: float) -> dict[str, float]:
 
 def _counts(ticks: Columns, timing: Columns) -> dict[str, int]:
     stalls: Any = timing.get("stalls", np.zeros(0))
+    lost = ticks["frames_lost"]  # since the camera was opened
     return {
         "frames": int(np.count_nonzero(ticks["number"] >= 0)),
         "late_ticks": int(ticks["late"].sum()),
-        "frames_lost": int(ticks["frames_lost"].sum()),
+        "frames_lost": counted(lost, before=int(lost[0])) if len(lost) else 0,
         "stalls": int(stalls.sum()),
     }
 
@@ -236,7 +237,8 @@ def _timing(ticks: Columns, timing: Columns) -> dict[str, float]:
     frames = ticks["number"] >= 0
     series = {name: (ticks[field][frames], of) for name, (field, of) in _OF_FRAMES.items()}
     series |= {name: (timing.get(name, np.empty(0)), of) for name, of in _OF_SECONDS.items()}
+    # A second without a servo's period has no lateness.
+    known = {name: (values[~np.isnan(values)], of) for name, (values, of) in series.items()}
     return {
-        name: float(of(values)) if len(values) else math.nan
-        for name, (values, of) in series.items()
+        name: float(of(values)) if len(values) else math.nan for name, (values, of) in known.items()
     }

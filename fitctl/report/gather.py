@@ -97,7 +97,7 @@ TICK_FIELDS: dict[str, Any] = {
 }
 
 _OF_A_HELD_STAR = (
-    *("error_az_px", "error_el_px", "fsm_az_rad", "fsm_el_rad"),
+    *("error_az_px", "error_el_px", "target_az_px", "target_el_px", "fsm_az_rad", "fsm_el_rad"),
     *("siderostat_az_rad", "siderostat_el_rad", "stack1_v", "stack2_v", "stack3_v"),
 )
 """What is known at every tick in VERNIER with a star; elsewhere NaN stands for what there was not."""
@@ -191,13 +191,13 @@ def gather(run: Run) -> Gathered:
     rooms = {topic: _room(run, topic, wanted) for topic, (_, wanted) in series.items()}
     filled = dict.fromkeys(series, 0)
     blocks: dict[tuple[str, str], list[Columns]] = defaultdict(list)
-    health: list[dict[str, Any]] = []
-    states: dict[str, str] = {}
+    rows: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
     fields: dict[str, Any] = {topic: wanted for topic, (_, wanted) in series.items()}
     fields[TOPICS[RecorderStatus]] = list(_FIELDS["recorder"])
     misdated = 0
     between_s = own_times_s(run.logs[-1], run.start_ns / 1e9, run.end_ns / 1e9)
     for log in run.logs:
+        states: dict[str, str] = {}
         for topic, block in column_blocks(log.path, [*series, *places], _ROWS, fields):
             columns, left_out = _of_the_run(between_s, block)
             misdated += left_out
@@ -206,16 +206,19 @@ def gather(run: Run) -> Gathered:
                 filled[topic] += _fill(rooms[topic], filled[topic], columns, time_s, str(log.path))
                 continue
             whole = _whole(places[topic][0], columns, str(log.path)) | {"time_s": time_s}
-            if places[topic][0] == "health":  # says the same every second, all night
-                health += _changes(_rows([whole]), states)
-            else:
+            if places[topic][0] in {"timing", "recorder"}:
                 blocks[places[topic]].append(whole)
+            elif places[topic][0] == "health":  # says the same every second, all night
+                rows[places[topic]] += _changes(_rows(whole), states)
+            else:
+                rows[places[topic]] += _rows(whole)
     for topic, room in rooms.items():
         room.update({name: column[: filled[topic]] for name, column in room.items()})
         _in_order(room)
+    lost = _joined(blocks["recorder", ""]).get("lost")  # of each recorder from its own start
     of_loop = {loop: rooms[topic] for topic, (loop, _) in series.items() if loop}
-    modes = [row for loop in loops for row in _rows(blocks["modes", loop])]
-    changes = [row for loop in loops for row in _rows(blocks["changes", loop])]
+    modes = [row for loop in loops for row in _once(rows["modes", loop])]
+    changes = [row for loop in loops for row in _once(rows["changes", loop])]
     return Gathered(
         run=run,
         ticks={loop: of_loop[loop] for loop in loops},
@@ -223,10 +226,10 @@ def gather(run: Run) -> Gathered:
         overlap=next((rooms[topic] for topic, (loop, _) in series.items() if not loop), None),
         modes=sorted(modes, key=itemgetter("time_s")),
         changes=sorted(changes, key=itemgetter("time_s")),
-        events=_rows(blocks["events", ""]),
-        health=health,
-        attempts=_rows(blocks["attempts", ""]),
-        lost=_lost(_joined(blocks["recorder", ""])),
+        events=_once(rows["events", ""]),
+        health=_changes(_once(rows["health", ""]), {}),
+        attempts=_once(rows["attempts", ""]),
+        lost=counted(lost, before=0) if lost is not None else None,
         misdated=misdated,
     )
 
@@ -363,18 +366,20 @@ def _in_order(columns: Columns) -> Columns:
     return columns
 
 
-def _rows(blocks: list[Columns]) -> list[dict[str, Any]]:
-    """Columns as records, in order of time, each once."""
-    rows = [
-        dict(zip(block, row, strict=True))
-        for block in blocks
-        for row in zip(*(column.tolist() for column in block.values()), strict=True)
-    ]
+def _rows(block: Columns) -> list[dict[str, Any]]:
+    """Columns as records: a column of texts has room for the longest one in every row."""
+    values = zip(*(column.tolist() for column in block.values()), strict=True)
+    return [dict(zip(block, row, strict=True)) for row in values]
+
+
+def _once(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Records in order of time, each once, though two files may have it."""
     rows.sort(key=itemgetter("time_s"))
     known: set[tuple[Any, ...]] = set()
     once = []
     for row in rows:
-        key = tuple(value for name, value in row.items() if name not in HEADER[::2])
+        # What is not a number is not equal to itself.
+        key = tuple(repr(value) for name, value in row.items() if name not in HEADER[::2])
         if key not in known:
             known.add(key)
             once.append(row)
@@ -391,10 +396,7 @@ def _changes(health: list[dict[str, Any]], states: dict[str, str]) -> list[dict[
     return changed
 
 
-def _lost(statuses: Columns) -> int | None:
-    """Records lost before the log; each recorder counts from its own start."""
-    if "lost" not in statuses:
-        return None
-    lost = statuses["lost"].astype(int)
-    more = np.diff(lost, prepend=0)
-    return int(np.where(more >= 0, more, lost).sum())
+def counted(counts: NDArray[Any], before: int) -> int:
+    """By how much a count has grown in all from `before` on; it starts anew from zero now and then."""
+    more = np.diff(counts.astype(int), prepend=before)
+    return int(np.where(more >= 0, more, counts).sum())

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from fitctl.logging.errors import ForeignTopicError, LogError
 from fitctl.logging.reading import HEADER, LogInfo, column_blocks, log_info
+from fitctl.logging.records import MetrologyTick, Tick
+from fitctl.logging.schemas import TOPICS
 from fitctl.messages.modes import Mode
 from fitctl.report.drawing import SERIES, TimeAxis, envelope, panels, styled, time_axis, trace
 from fitctl.text import plain
@@ -30,7 +32,7 @@ _TERMINAL_BINS = 400
 _COLOURS = ("blue", "orange", "green", "magenta", "cyan", "red")
 _MOST_PIECES = 40
 _LEAST_LINES = 12  # of a panel
-_TICKS = ("/tick", "/metrology")  # as the topics of ticks end
+_TICKS = [TOPICS[kind].format(loop="*") for kind in (Tick, MetrologyTick)]
 UNITS = ("px", "v", "s", "rad", "arcsec", "dn", "fraction", "progress", "ns")
 
 
@@ -138,11 +140,13 @@ _Modes = dict[str, tuple[NDArray[np.int64], NDArray[np.int64]]]
 
 def _modes(path: Path, info: LogInfo) -> _Modes:
     """Of each loop, as its ticks say: times in UTC, nanoseconds since 1970, and modes by number."""
-    topics = [topic for topic in info.counts if topic.endswith(_TICKS)]
+    topics = [topic for topic in info.counts if any(fnmatchcase(topic, each) for each in _TICKS)]
     parts: dict[str, list[tuple[Any, Any]]] = defaultdict(list)
     for topic, columns in column_blocks(
         path, topics, _ROWS, {topic: ["mode_number"] for topic in topics}
     ):
+        if "mode_number" not in columns:  # another program's
+            continue
         loop = topic.rpartition("/")[0]
         parts[loop].append((columns["publish_time_ns"], columns["mode_number"]))
     return {

@@ -35,6 +35,7 @@ from fitctl.logging.reading import Columns
 from fitctl.report.gather import Gathered
 from fitctl.report.residual import Estimate, rms_estimate
 from fitctl.report.selection import Selection
+from fitctl.text import plain, plain_message
 
 Floats = NDArray[np.float64]
 AT_HZ = (0.25, 0.5, 1.0, 2.0, 5.0)
@@ -218,7 +219,7 @@ def _in_force(gathered: Gathered, loop_name: str) -> list[_InForce]:
     for (begin_s, its, design), end_s in zip(begins, ends, strict=True):
         number = numbers.setdefault(design, len(numbers) + 1) if its == LEARNT else 1
         title = its if number == 1 else f"{its} ({number})"
-        found.append(_InForce(begin_s, end_s, title, its, design))
+        found.append(_InForce(begin_s, end_s, plain(title), plain(its), design))
     return found
 
 
@@ -272,9 +273,9 @@ def _design(
 
 
 def _parsed(text: str) -> dict[str, Any]:
-    """A logged design; empty if it is none that this fitctl wrote."""
+    """A logged design, its texts made printable; empty if it is none that this fitctl wrote."""
     try:
-        logged = json.loads(text or "{}", parse_int=float)
+        logged = plain_message(json.loads(text or "{}", parse_int=float))
     except (ValueError, RecursionError):
         return {}
     return logged if isinstance(logged, dict) else {}

@@ -145,7 +145,7 @@ def verdict(
     if few:
         return Verdict(
             "not known",
-            f"too short to judge: the {evaluated_s:.0f} s evaluated have too few independent values of the "
+            f"too short to judge: the {evaluated_s:.3g} s evaluated have too few independent values of the "
             f"error in {' and '.join(few)} for an interval",
         )
     if all(found.high <= requirement for found in axes.values()):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections import defaultdict
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -117,6 +118,7 @@ def _modes_and_events(
 ) -> None:
     """Bars of modes, a row a loop, and the warnings and errors above them."""
     labels: dict[str, str] = {}
+    bars: defaultdict[tuple[int, str], list[tuple[float, float]]] = defaultdict(list)
     for row, loop in enumerate(loops):
         faults_s = [
             change["time_s"]
@@ -127,14 +129,11 @@ def _modes_and_events(
             fault = mode is Mode.SAFE and any(abs(at_s - begin_s) < 1.0 for at_s in faults_s)
             label, color = _label_and_color(mode, fault=fault)
             labels[label] = color
-            axes.barh(
-                -row,
-                (end_s - begin_s) / time.s_per_unit,
-                left=begin_s / time.s_per_unit,
-                height=0.6,
-                color=color,
-                linewidth=0,
+            bars[row, color].append(
+                (begin_s / time.s_per_unit, (end_s - begin_s) / time.s_per_unit)
             )
+    for (row, color), spans in bars.items():  # a bar for each span takes milliseconds
+        axes.broken_barh(spans, (-row - 0.3, 0.6), color=color, linewidth=0)
     for label, color in labels.items():
         axes.barh(0, 0, color=color, label=label)
     for level, (sign, color, label) in _SIGNS.items():

@@ -18,6 +18,7 @@ from fitctl.commands.shared.supervisor import send_and_print
 from fitctl.config import ConfigError, default_rig_path, load_rig, rig_from_document
 from fitctl.daemon.run import run_info
 from fitctl.drivers.interface import DeviceIdentity
+from fitctl.logging.records import Tick
 from fitctl.logging.schemas import TOPICS
 from fitctl.logging.writer import LogWriter
 from fitctl.messages import client as clients
@@ -138,6 +139,27 @@ def test_a_log_with_the_attack_in_every_field_prints_nothing_raw(command, json_,
     assert raw(printed.out + printed.err) == []
     if json_ and printed.out:
         json.loads(printed.out)
+
+
+def test_an_error_that_quotes_a_log_is_one_line(tmp_path, capsys):
+    rig, path = load_rig(default_rig_path()), tmp_path / "evil.mcap"
+    info = run_info(rig, "simulated", now_s=0.0, designs={})
+    document = json.loads(info.rig_json)
+    document["camera"]["dark_file"] = EVIL
+    with LogWriter(path, rig.logging) as log:
+        log.write(msgspec.structs.replace(info, rig_json=json.dumps(document)), 1.8e9)
+        log.write(evil(Tick), 1.8e9)
+
+    for command, quoted in (
+        (["log", "cut", str(path), "--topic", "nope"], "Available: /fit/a"),
+        (["replay", str(path)], "the dark frame's name, a"),
+    ):
+        with pytest.raises(SystemExit):
+            main(command)
+        printed = capsys.readouterr().err
+        assert quoted in printed
+        assert printed.count("\n") == 1
+        assert raw(printed) == []
 
 
 def test_what_a_device_says_of_itself_is_safe_in_doctor_s_table(rig, capsys, monkeypatch):

@@ -361,6 +361,25 @@ def test_a_mirror_that_moves_a_little_less_is_designed_for_as_known_and_judged_a
     assert advice.shown_px[0] != pytest.approx(advice.present.residual_px, rel=0.001)
 
 
+def test_on_a_mirror_that_moves_more_both_designs_count_on_that_mirror(paper, fixed):
+    _, series = held(paper, fixed, TWO_MINUTES_S, 5, mirror_gain=1.4)
+    advice = advise([series], (0.0, 0.0), paper, fixed)
+    present_px, learnt_px = advice.present.residual_px, advice.learnt.residual_px
+
+    assert advice.night.mirror_gain.low > 1.15
+    assert advice.shown_px == pytest.approx((present_px, learnt_px))
+    assert learnt_px < 0.97 * present_px
+    assert "the mirror moves less" not in "".join(advice.lines_of_text())
+
+
+def test_a_design_that_would_be_unstable_on_the_mirror_of_the_night_gets_no_advice(paper, fixed):
+    _, series = held(paper, fixed, TWO_MINUTES_S, 5, mirror_gain=1.8)
+    restless = dataclasses.replace(fixed, c=2.0 * fixed.c, d=2.0 * fixed.d)
+
+    with pytest.raises(ConfigError, match="the design in force would be unstable with that"):
+        advise([series], (0.0, 0.0), paper, restless)
+
+
 def test_a_design_that_would_not_have_been_better_lately_is_not_worth_it(six_hz):
     _, advice = six_hz
     present_px, learnt_px = advice.lately_px

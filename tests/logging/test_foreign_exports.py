@@ -11,14 +11,14 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.descriptor_pool import DescriptorPool
 from mcap.writer import Writer as PlainWriter
 from mcap_protobuf.writer import Writer
-from samples.log_samples import tick, write_log
+from samples.log_samples import RUN_INFO, filled, tick, write_log
 
 from fitctl.logging.copying import merge
 from fitctl.logging.errors import LogError
 from fitctl.logging.exporting import export
 from fitctl.logging.reading import column_blocks
-from fitctl.logging.records import Tick
-from fitctl.logging.schemas import message_class
+from fitctl.logging.records import ExperimentStart, Tick
+from fitctl.logging.schemas import TOPICS, message_class
 
 TICKS, FRAMES, EVENTS = "/fit/right/tick", "/fit/camera/frame", "/fit/events"
 
@@ -107,6 +107,17 @@ def test_two_topics_that_would_become_one_file_are_refused(tmp_path, kind):
     with pytest.raises(LogError, match=r"and another topic both become fit\.right\.tick"):
         export(log, tmp_path / "out", kind, [TICKS, "/fit.right.tick"])
     assert not (tmp_path / "out").exists()
+
+
+def test_a_name_keeps_its_name(tmp_path):
+    """Only that of an event is its source, as everywhere in fitctl."""
+    experiment = filled(ExperimentStart, name="rest")
+    log = write_log(tmp_path / "a.mcap", [RUN_INFO, experiment])
+
+    export(log, tmp_path / "npz", "npz", [TOPICS[ExperimentStart].format(loop="right")])
+
+    columns = np.load(tmp_path / "npz" / "fit.right.experiment.npz")
+    assert columns["name"].tolist() == ["rest"]
 
 
 def test_bytes_are_exported_so_that_they_can_be_read_back_without_pickle(tmp_path):

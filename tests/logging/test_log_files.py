@@ -9,12 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import SeekingReader
+from samples.forged_logs import forged
 from samples.log_samples import (
     RUN_INFO,
     SETTINGS,
     WALL_S,
     contents,
     files_end_at,
+    filled,
     frame,
     one_of_each,
     tick,
@@ -24,6 +26,7 @@ from samples.log_samples import (
 from fitctl.logging.errors import LogError
 from fitctl.logging.indexed import IndexedReader
 from fitctl.logging.reading import HEADER, column_blocks, log_info, read_records, tick_arrays
+from fitctl.logging.records import Event
 from fitctl.logging.schemas import to_message, topic_of
 from fitctl.logging.writer import LogWriter
 
@@ -55,6 +58,32 @@ def test_what_was_written_is_read(tmp_path, compression):
 def test_ticks_and_frames_keep_their_numbers(tmp_path):
     path = write_log(tmp_path / "a.mcap", [tick(8), frame(41), tick(9), *one_of_each()[2:3]])
     assert [entry.sequence for entry in read_records(path)] == [8, 41, 9, 1]
+
+
+def test_a_block_with_a_long_text_has_fewer_rows(tmp_path):
+    """An array of texts has room for the longest one in every row."""
+    long = [
+        filled(Event, severity="info", message="x" * (1_000_000 if number == 3 else 1))
+        for number in range(20)
+    ]
+    path = write_log(tmp_path / "a.mcap", [RUN_INFO, *long])
+
+    blocks = [columns["message"] for _, columns in column_blocks(path, rows=2000)]
+
+    assert [text for block in blocks for text in block] == [event.message for event in long]
+    assert max(block.nbytes for block in blocks) < 30e6
+
+
+def test_a_log_whose_index_counts_no_messages_is_damaged(tmp_path):
+    source = write_log(tmp_path / "a.mcap", [RUN_INFO, tick(1)])
+
+    def add(writer):
+        writer._Writer__statistics.message_count = 0
+
+    path = forged(source, tmp_path / "b.mcap", lambda _: None, add)
+
+    with pytest.raises(LogError, match="its index counts 0 messages, and 1 by channel"):
+        log_info(path)
 
 
 def test_topics_can_be_chosen(tmp_path):

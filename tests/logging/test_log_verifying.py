@@ -3,10 +3,11 @@
 import contextlib
 
 import pytest
+from foxglove_schemas_protobuf.Log_pb2 import Log
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import MCAP0_MAGIC
-from samples.forged_logs import forged
+from samples.forged_logs import forged, with_messages_of_another_program
 from samples.log_samples import (
     RUN_INFO,
     SETTINGS,
@@ -121,6 +122,17 @@ def test_records_whose_own_time_is_not_the_logs_are_named(tmp_path):
         "record 2 (/fit/right/tick): its own time is more than a day outside the log's; 2 records are so, and "
         "reports leave them out",
     )
+
+
+@pytest.mark.parametrize("topic", ["/fit/recorder/status", "/fit/camera/frame"])
+def test_messages_of_another_type_under_a_topic_of_fitctl_are_one_problem(tmp_path, topic):
+    path = with_messages_of_another_program(tmp_path / "b.mcap", topic, Log(message="x"))
+
+    verdict = verify(path)
+
+    assert (verdict.records, verdict.lost, verdict.frames_missing) == (3, 0, 0)
+    (problem,) = verdict.problems
+    assert problem.startswith(f"{topic}: has messages of type foxglove.Log, ")
 
 
 def test_what_is_no_log_is_refused(tmp_path):

@@ -3,6 +3,8 @@
 import msgspec
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from samples.forged_logs import with_messages_of_another_program
 from samples.log_samples import RUN_INFO, frame, tick, write_log
 
 from fitctl.logging.errors import LogError
@@ -72,3 +74,10 @@ def test_a_log_without_frames_is_refused(pictures):
 def test_frames_of_another_size_are_refused_with_both_sizes(pictures):
     with pytest.raises(LogError, match=r"40 x 40 px where the rig's camera has 41 x 40"):
         pictures(at(0), size=(41, 40))
+
+
+def test_frames_that_are_no_pictures_are_refused(tmp_path):
+    path = with_messages_of_another_program(tmp_path / "b.mcap", "/fit/camera/frame", Log())
+
+    with pytest.raises(LogError, match=r"b\.mcap: /fit/camera/frame has messages of type foxglove"):
+        LoggedPictures(path, *SIZE, PERIOD_S, 1000.0, print)

@@ -1,7 +1,9 @@
 import dataclasses
+import math
 
 import numpy as np
 import pytest
+from samples.forged_logs import forged
 from samples.learner_reports import LINE, report
 from samples.report_samples import record
 
@@ -9,10 +11,14 @@ from fitctl.controllers.design.basis import basis
 from fitctl.controllers.design.choose import design_for
 from fitctl.controllers.design.linear_loop.loopshape import sampled_response
 from fitctl.figures.rigs import with_controller
+from fitctl.logging.errors import LogError
+from fitctl.logging.records import LoopTiming, Tick
+from fitctl.logging.schemas import TOPICS
 from fitctl.messages.commands import SetController
 from fitctl.model.hysteresis import half_widths_v, stack_gains
 from fitctl.report import tables
 from fitctl.report.findings import find
+from fitctl.report.gather import counted
 from fitctl.report.run import find_run
 from fitctl.report.stages import stacks
 
@@ -180,3 +186,47 @@ def test_a_disturbance_that_cannot_be_designed_for_leaves_the_measurement(held, 
     assert found.predicted is None
     assert "air_path.gain_px" in found.why
     assert found.table()[0][1] > 1
+
+
+def test_a_camera_that_is_opened_again_counts_its_lost_frames_anew():
+    lost = np.array([2, 2, 3, 0, 0, 1], np.int32)
+
+    assert counted(lost, before=2) == 2
+    assert counted(lost[:0], before=0) == 0
+
+
+def test_frames_that_were_lost_once_are_counted_once_and_one_second_without_servo_periods_hides_none(
+    held, tmp_path
+):
+    middle_s = 40.0
+
+    def change(entry):
+        message = entry.message
+        if entry.topic == TOPICS[Tick].format(loop="right") and message.time_s > middle_s:
+            message.frames_lost = 2
+        elif entry.topic == TOPICS[LoopTiming].format(loop="right"):
+            message.servo_late_worst_s = math.nan if message.time_s < middle_s else 0.001
+            message.servo_late_median_s = message.servo_late_worst_s
+
+    loop = find(find_run([forged(held[1], tmp_path / "lost.mcap", change)])).loops["right"]
+
+    assert loop.counts["frames_lost"] == 2
+    assert loop.timing["servo_late_median_s"] == loop.timing["servo_late_worst_s"] == 0.001
+
+
+def test_a_target_that_is_not_known_where_the_star_is_held_is_refused(held, tmp_path):
+    path = forged_of_held(held[1], tmp_path / "target.mcap", target_az_px=math.nan)
+
+    with pytest.raises(LogError, match="target_az_px"):
+        find(find_run([path]))
+
+
+def forged_of_held(source, target, **values):
+    """The log of a held star, where every tick has these values."""
+
+    def change(entry):
+        if entry.topic == TOPICS[Tick].format(loop="right"):
+            for name, value in values.items():
+                setattr(entry.message, name, value)
+
+    return forged(source, target, change)

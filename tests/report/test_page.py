@@ -338,6 +338,16 @@ def test_no_text_in_a_plot_leaves_it_for_the_page_or_for_another_folder(tmp_path
     assert len(list(inside.iterdir())) == 2
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_name_that_the_font_lacks_is_drawn_without_a_warning(tmp_path):
+    with styled():
+        figure, (axes,) = panels(1, 2.0)
+        axes.set(title="\u661f")
+        draw(Plot("right", "star", "", figure), tmp_path)
+
+    assert "\u661f" in (tmp_path / "right.svg").read_text(encoding="utf-8")
+
+
 def test_a_log_whose_rig_has_markup_for_names_is_refused(rig, tmp_path):
     document = rig.model_dump(mode="json")
     for table in (document["loops"], document["plant"]["loops"], document["mocks"]["loops"]):

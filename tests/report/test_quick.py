@@ -1,6 +1,11 @@
 import numpy as np
 import pytest
-from samples.forged_logs import forged_of, with_topic_of_another_program
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from samples.forged_logs import (
+    forged_of,
+    with_messages_of_another_program,
+    with_topic_of_another_program,
+)
 from samples.log_samples import RUN_INFO, filled, frame, tick, write_log
 
 from fitctl.logging.errors import LogError
@@ -117,6 +122,16 @@ def test_a_metrology_loop_s_mode_is_its_own(tmp_path):
     (series,) = read_series(path, ["beam_az_arcsec"], mode=Mode.LOCKED)
 
     assert len(series.values) == 1
+
+
+@pytest.mark.parametrize("topic", ["/odom/tick", "/fit/odom/tick"])
+def test_ticks_of_another_program_have_no_mode(tmp_path, topic):
+    path = with_messages_of_another_program(tmp_path / "b.mcap", topic, Log(line=7))
+    mode = Mode(tick(1).mode_number)
+
+    (series,) = read_series(path, ["/fit/right/tick.star_az_px"], mode=mode)
+
+    assert series.values == [tick(1).star_az_px]
 
 
 def test_a_mode_that_never_was_leaves_nothing(held):

@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import itertools
 import json
+import math
 import re
 from pathlib import Path
 
@@ -148,6 +149,26 @@ def test_two_loops_are_judged_each_by_itself(rig, tmp_path):
 
     assert list(found.loops) == ["right", "left"]
     assert all(len(loop.ticks["time_s"]) > 100 for loop in found.loops.values())
+
+
+def test_what_two_files_have_both_counts_once_and_no_device_recovers_between_them(rig, tmp_path):
+    """A change of mode that knows no angles of a link, and states of a device."""
+    info = run_info(rig, "simulated", now_s=0.0, designs=designs_of(rig))
+    changed = filled(ModeChange, time_s=3.2, target="SAFE", link_az_rad=math.nan)
+    states = [
+        filled(DeviceHealth, time_s=float(second), device="camera", state=state)
+        for second, state in enumerate(["ok", "ok", "ok", "fault", "fault"])
+    ]
+    for name, part in (("a", states), ("b", states[2:])):
+        with LogWriter(tmp_path / f"{name}.mcap", rig.logging) as log:
+            log.write(info, info.wall_minus_monotonic_s)
+            for each in [*part, changed]:
+                log.write(each, info.wall_minus_monotonic_s + each.time_s)
+
+    found = gather(find_run([tmp_path / "a.mcap", tmp_path / "b.mcap"]))
+
+    assert [mode["target"] for mode in found.modes] == ["SAFE"]
+    assert [(row["time_s"], row["state"]) for row in found.health] == [(0.0, "ok"), (3.0, "fault")]
 
 
 def test_every_recorder_counts_its_own_losses(rig, tmp_path):

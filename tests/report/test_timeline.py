@@ -29,6 +29,16 @@ def test_a_mode_of_another_version_is_shown_as_not_known(findings):
     assert Mode.VERNIER.name in labels
 
 
+def test_a_loop_that_changes_its_mode_at_every_tick_is_drawn_in_few_pieces(findings):
+    loop = findings.loops["right"]
+    numbers = np.resize([Mode.VERNIER, Mode.COARSE], len(loop.ticks["mode_number"]))
+
+    with styled():
+        figure = timeline(findings, with_ticks(loop, mode_number=numbers), time_axis(60, "")).figure
+
+    assert len(figure.axes[0].get_children()) < 50
+
+
 @pytest.mark.parametrize(
     ("length_s", "shown"),
     [

@@ -2,7 +2,8 @@
 
 from mcap.reader import make_reader
 from mcap.writer import Writer
-from samples.log_samples import RUN_INFO, tick, write_log
+from mcap_protobuf.schema import register_schema
+from samples.log_samples import RUN_INFO, WALL_S, tick, write_log
 
 from fitctl.logging.reading import read_records
 
@@ -64,5 +65,20 @@ def with_topic_of_another_program(target):
     def add(writer):
         channel = writer.register_channel("/odo", "json", schema_id=0)
         writer.add_message(channel, log_time=2 * 10**18, data=b"{}", publish_time=2 * 10**18)
+
+    return forged(source, target, lambda _: None, add)
+
+
+def with_messages_of_another_program(target, topic, message):
+    """A log of a tick, with two messages of any protobuf type under a topic."""
+    source = write_log(target.with_name("as_recorded.mcap"), [RUN_INFO, tick(1)])
+
+    def add(writer):
+        kind = register_schema(writer, type(message))
+        channel = writer.register_channel(topic, "protobuf", kind)
+        for after_ns in (0, 1):
+            time_ns = round((WALL_S + 1) * 1e9) + after_ns
+            data = message.SerializeToString()
+            writer.add_message(channel, log_time=time_ns, data=data, publish_time=time_ns)
 
     return forged(source, target, lambda _: None, add)

@@ -29,6 +29,7 @@ from fitctl.logging import copying, exporting, folder, verifying
 from fitctl.logging.errors import LogError
 from fitctl.logging.listing import logs_in, rig_name
 from fitctl.logging.reading import LogInfo, log_info
+from fitctl.text import plain
 
 _TOO_LARGE = "too large to be read here"
 
@@ -65,25 +66,35 @@ def list_(rig: RigOption = None, overrides: SetOption = None, as_json: JsonOptio
     Reads the folder `logging.folder` of the rig file. Exit status 1 if a log in it cannot be read.
     """
     where = logging_rig("log list", rig, overrides).logging.folder_path
-    logs, problems = logs_in(where)
+    found, problems = logs_in(where)
+    sizes = {log.path: _size(log.path) for log in found}
+    logs = [log for log in found if sizes[log.path] is not None]
     if as_json:
-        say(to_json([_listed(log) for log in logs]))
+        say(to_json([_listed(log, sizes[log.path]) for log in logs]))
     elif not logs:
         say(f"{where}: no logs")
     else:
         for log in logs:
             begin = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(log.start_s))
             span = f"{begin}  {log.duration_s:9.1f} s" if log.counts else "without any record"
-            size = f"{log.path.stat().st_size / 1e6:9.1f} MB"
+            size = f"{(sizes[log.path] or 0) / 1e6:9.1f} MB"
             say(f"{log.path}  {span:<36}  {size}  {rig_name(log)}, {_state(log.path, log)}")
     for problem in problems.values():
         say(str(problem), err=True)
     raise typer.Exit(FAILED if problems else 0)
 
 
-def _listed(found: LogInfo) -> dict[str, object]:
+def _size(log: Path) -> int | None:
+    """Bytes of a log; None where the recorder has just deleted it."""
+    try:
+        return log.stat().st_size
+    except FileNotFoundError:
+        return None
+
+
+def _listed(found: LogInfo, size: int | None) -> dict[str, object]:
     document = _info_document(
-        found, kept=folder.is_kept(found.path), recording=folder.in_use(found.path)
+        found, size, kept=folder.is_kept(found.path), recording=folder.in_use(found.path)
     )
     del document["counts"], document["metadata"]
     return document | {"rig": rig_name(found)}
@@ -115,7 +126,7 @@ def info(
         found = log_info(log)
         if as_json:
             kept, recording = folder.is_kept(log), folder.in_use(log)
-            say(to_json(_info_document(found, kept=kept, recording=recording)))
+            say(to_json(_info_document(found, _size(log), kept=kept, recording=recording)))
         else:
             _print_info(found)
 
@@ -132,11 +143,13 @@ def _print_info(found: LogInfo) -> None:
         say(f"  {topic:<{width}}  {count}")
 
 
-def _info_document(found: LogInfo, *, kept: bool, recording: bool) -> dict[str, object]:
+def _info_document(
+    found: LogInfo, size: int | None, *, kept: bool, recording: bool
+) -> dict[str, object]:
     span = {"start_s": found.start_s, "end_s": found.end_s} if found.counts else {}
     return {
         "path": str(found.path),
-        "bytes": found.path.stat().st_size,
+        "bytes": size,
         "finished": found.finished,
         "recording": recording,
         "kept": kept,
@@ -448,7 +461,7 @@ def _topics(found: LogInfo, patterns: list[str] | None) -> list[str]:
     """
     for pattern in patterns or ():
         if not any(fnmatchcase(topic, pattern) for topic in found.counts):
-            there = ", ".join(sorted(found.counts)) or "none"
+            there = plain(", ".join(sorted(found.counts))) or "none"
             msg = f"--topic {pattern}: {found.path} has no such topic. Available: {there}"
             raise ConfigError(msg)
     return [

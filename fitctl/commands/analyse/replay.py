@@ -84,8 +84,9 @@ def replay(
         dark_file = None if rig else missing_dark_file(info, settings)
         if dark_file is not None:
             msg = (
-                f"{info.path}: an older fitctl recorded it, and kept only the dark frame's name, {dark_file}; "
-                "no file is read because a log names it: name the dark frame with --set camera.dark_file=FILE"
+                f"{info.path}: an older fitctl recorded it, and kept only the dark frame's name, "
+                f"{plain(dark_file)}; no file is read because a log names it: name the dark frame with "
+                "--set camera.dark_file=FILE"
             )
             raise ConfigError(msg)
         result = _replayed(info, settings, keep_controllers=controller is not None)

@@ -7,10 +7,9 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Protocol
 
-import msgspec
 import typer
 
-from fitctl.text import plain
+from fitctl.text import json_bytes, plain
 
 if TYPE_CHECKING:
     from fitctl.messages.telemetry import Telemetry
@@ -36,7 +35,7 @@ def say_lines(text: str, *, err: bool = False) -> None:
 
 def to_json(result: Any) -> str:
     """One line; what was not reached is null."""
-    return msgspec.json.encode(result).decode()
+    return json_bytes(result).decode()
 
 
 @contextmanager

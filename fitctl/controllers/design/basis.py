@@ -188,6 +188,9 @@ def night_of(design: Design, rig_basis: Basis) -> Basis:
 
 
 _QUOTED = 60  # characters of a value that cannot be
+_MOST_LINES = (
+    32  # a design takes a time that grows with their cube; the learner finds eight at most
+)
 
 
 class _Line(Settings):
@@ -203,7 +206,7 @@ class _Parameters(Settings):
     air_path: AirPathModel
     coarse_per_s: NonNegative
     settings: dict[str, dict[str, Any]]
-    lines: Annotated[list[_Line], Field(default_factory=list)]
+    lines: Annotated[list[_Line], Field(default_factory=list, max_length=_MOST_LINES)]
     guard: _Line | None = None
     mirror_gain: Annotated[float, Field(ge=LEAST_GAIN, le=1 / LEAST_GAIN)] = 1.0
     overshoot: Annotated[float, Field(ge=-MOST_OVERSHOOT, le=MOST_OVERSHOOT)] = 0.0
@@ -224,7 +227,7 @@ def basis_of(parameters: Mapping[str, Any], rig_basis: Basis) -> Basis:
         sections = {
             name: type(getattr(settings, name)).model_validate(values)
             for name, values in given.settings.items()
-            if name in type(settings).model_fields
+            if isinstance(getattr(settings, name, None), Settings)
         }
     except ValidationError as error:
         problem = error.errors()[0]

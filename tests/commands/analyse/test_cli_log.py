@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import re
 import sys
 
@@ -330,6 +331,23 @@ def test_a_log_of_another_program_is_not_called_damaged(log, tmp_path):
     assert problem == (
         f"{path}: has topics in another format than fitctl's: /odo is in json; expected protobuf"
     )
+
+
+def test_a_log_whose_name_is_not_utf_8_is_read_and_recovered(log, whole, broken):
+    odd, torn = (whole.with_name(os.fsdecode(name)) for name in (b"h\xff.mcap", b"c\xff.mcap"))
+    whole.rename(odd)
+    broken.rename(torn)
+
+    for command in ("info", "verify", "summary"):
+        _, text, problem = log(command, odd, "--json")
+        found = json.loads(text)
+        path = (found[0] if command == "verify" else found)["path"]
+        assert (path, problem) == (f"{odd.parent}/h\\udcff.mcap", "")
+
+    status, text, _ = log("recover", torn)
+    assert status == 0
+    assert text.startswith(f"{torn.parent}/c\\udcff_recovered.mcap: ")
+    assert log("verify", torn.with_name(os.fsdecode(b"c\xff_recovered.mcap")))[0] == 0
 
 
 def test_damage_without_words_has_words(log, whole, monkeypatch):

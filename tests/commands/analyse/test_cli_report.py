@@ -60,6 +60,20 @@ def test_a_report_stands_beside_its_log_and_is_opened_in_the_browser(off, fitctl
 
 
 @pytest.mark.long
+def test_a_log_whose_name_is_not_utf_8_has_a_report(off, fitctl, tmp_path):
+    odd = Path(shutil.copy(off, tmp_path / os.fsdecode(b"h\xff.mcap")))
+
+    status, _, _ = fitctl("report", odd)
+
+    folder = tmp_path / os.fsdecode(b"h\xff_report")
+    assert status == 0
+    assert r"h\udcff" in (folder / "report.html").read_text(encoding="utf-8")
+    assert json.loads((folder / "report.json").read_bytes())["logs"] == [
+        rf"{tmp_path}/h\udcff.mcap"
+    ]
+
+
+@pytest.mark.long
 def test_nights_side_by_side_and_a_line_that_says_what_a_pdf_needs(
     off, fitctl, tmp_path, monkeypatch
 ):

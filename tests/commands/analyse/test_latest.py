@@ -11,7 +11,7 @@ from samples.log_samples import RUN_INFO, WALL_S, one_of_each, tick, write_log
 from fitctl.cli import main
 from fitctl.config import default_rig_path, load_rig
 from fitctl.logging.copying import merge, recover
-from fitctl.logging.listing import newest_run
+from fitctl.logging.listing import logs_in, newest_run
 from fitctl.report.run import find_run
 
 SHIPPED = load_rig(default_rig_path())
@@ -84,6 +84,21 @@ def test_list_names_a_file_that_cannot_be_read(fitctl, logs):
     assert status == 1
     assert len(text.splitlines()) == 3
     assert "torn.mcap" in problems
+
+
+@pytest.mark.parametrize("json_", [[], ["--json"]])
+def test_list_leaves_out_a_log_that_is_deleted_meanwhile(fitctl, logs, monkeypatch, json_):
+    def read_and_deleted(folder):
+        found = logs_in(folder)
+        (logs / "z.mcap").unlink()
+        return found
+
+    monkeypatch.setattr("fitctl.commands.analyse.log.logs_in", read_and_deleted)
+
+    status, text, problems = fitctl("log", "list", *json_)
+
+    assert (status, problems) == (0, "")
+    assert ["b.mcap" in text, "a.mcap" in text, "z.mcap" in text] == [True, True, False]
 
 
 @pytest.mark.parametrize("command", [("log", "info"), ("log", "verify")])
@@ -276,6 +291,16 @@ def test_what_was_recovered_counts_in_place_of_the_damaged_file(fitctl, logs):
     assert text.startswith("logs/b_recovered.mcap: ")
     (line,) = problems.splitlines()
     assert line.startswith("logs/b.mcap: ")
+
+
+def test_what_was_recovered_of_a_name_that_is_not_utf_8_counts_too(fitctl, logs):
+    (logs / "a.mcap").unlink()
+    os.utime(logs / "z.mcap", (1.0, 1.0))
+    odd = (logs / "b.mcap").rename(logs / os.fsdecode(b"b\xff.mcap"))
+    damaged(odd, written_s=2.0)
+    recover(odd, logs / "saved.mcap")
+
+    assert newest_run(logs, RIG) == [logs / "saved.mcap"]
 
 
 def test_what_was_recovered_is_left_out_beside_the_file_itself(fitctl, logs):

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fitctl.config import ConfigError, default_rig_path, load_rig
-from fitctl.controllers.design.basis import basis
+from fitctl.controllers.design.basis import basis, basis_of
 from fitctl.controllers.design.choose import DESIGNS, design_for
 from fitctl.controllers.design.files import load_design, save_design
 
@@ -182,6 +182,24 @@ def test_a_file_too_large_for_a_design_is_refused(tmp_path, fit):
     path = tmp_path / "pair.json"
     path.write_text("[" + "1," * 600_000 + "1]")
     assert "more than 1 MiB" in refusal(path, fit)
+
+
+def test_a_learnt_design_of_more_lines_than_anybody_finds_is_refused(fit):
+    line = {"frequency_hz": 6.0, "damping": 0.01, "rms_px": 0.01}
+    air = {"gain_px": 0.45, "b1_s2": 0.517, "b2_s": 2.5}
+    night = {"noise_px": 0.01, "air_path": air, "coarse_per_s": 0.46, "settings": {}}
+
+    with pytest.raises(ValueError, match="lines: List should have at most 32 items"):
+        basis_of(night | {"lines": [line] * 300}, fit)
+
+
+def test_what_is_no_section_of_settings_in_a_learnt_design_is_left_out(fit):
+    air = {"gain_px": 0.45, "b1_s2": 0.517, "b2_s": 2.5}
+    night = {"noise_px": 0.01, "air_path": air, "coarse_per_s": 0.46}
+
+    of_night = basis_of(night | {"settings": {"controller": {}, "nothing": {}}}, fit)
+
+    assert of_night.settings == fit.settings
 
 
 def test_designs_are_the_same_each_time(rig):
