@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -89,7 +90,7 @@ def design(
     if out is not None and out.suffix != ".json":
         msg = f"design {what}: --out {out}: must end in .json, or no rig file can name it"
         raise ConfigError(msg)
-    if out is not None and out.exists() and not overwrite:
+    if out is not None and os.path.exists(out) and not overwrite:
         msg = f"design {what}: --out {out}: exists already; give another name, or pass --overwrite"
         raise ConfigError(msg)
     name = "lqg-ltr" if what == "vernier" else what

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
+import os
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +64,7 @@ def own_design(path: Path, its_basis: Basis) -> Design:
 
 
 def _function(path: Path) -> Any:
-    if not path.is_file():
+    if not os.path.isfile(path):  # also where it cannot be examined
         msg = f"controller {path}: no such file; expected a Python file with a function {FUNCTION}(basis)"
         raise ConfigError(msg)
     spec = importlib.util.spec_from_file_location(f"fitctl_own_{path.stem}", path)

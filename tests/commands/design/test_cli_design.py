@@ -36,6 +36,23 @@ def design(capsys):
     return run
 
 
+@pytest.mark.parametrize(
+    ("arguments", "why"),
+    [
+        (["own/{}.py"], "expected 1 to 32 letters"),
+        (["{}/own.py"], "no such file"),
+        (["learn", "{}.mcap"], "File name too long"),
+        (["vernier", "--out", "{}.json"], "File name too long"),
+    ],
+)
+def test_a_name_that_no_file_can_have_is_one_line(design, arguments, why):
+    status, _, error = design(*(argument.format(300 * "x") for argument in arguments))
+
+    assert status == 2
+    assert why in error
+    assert error.count("\n") == 1
+
+
 @pytest.mark.long
 def test_a_design_that_is_there_is_overwritten_only_if_asked_to(design, tmp_path):
     path = tmp_path / "mine.json"
