@@ -23,9 +23,10 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from benchmarks.swarm.happenings import Plan
 from benchmarks.swarm.invariants import NO_EXCEPTION
 from benchmarks.swarm.past import DEFECTS, put_back
-from benchmarks.swarm.plan import Plan, plan_of
+from benchmarks.swarm.plan import plan_of
 from benchmarks.swarm.run import Result, failed_run, run_plan
 from benchmarks.swarm.shrink import shrunk, shrunk_from
 from benchmarks.swarm.wires.drivers import NIGHTS

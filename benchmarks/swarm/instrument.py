@@ -20,10 +20,7 @@ from benchmarks.swarm.devices.amplifiers import SwarmAmplifiers
 from benchmarks.swarm.devices.hexapod import SwarmHexapod
 from benchmarks.swarm.devices.mirror import SwarmDac, SwarmPiezo
 from benchmarks.swarm.devices.sensors import SwarmCamera, SwarmPhotodiodes
-from benchmarks.swarm.invariants import ANSWERED_ONCE, Invariants
-from benchmarks.swarm.lines import Bus, Line
-from benchmarks.swarm.own_stars import turned_by
-from benchmarks.swarm.plan import (
+from benchmarks.swarm.happenings import (
     ClockStep,
     Cloud,
     FullDisk,
@@ -37,6 +34,9 @@ from benchmarks.swarm.plan import (
     Stall,
     Strike,
 )
+from benchmarks.swarm.invariants import ANSWERED_ONCE, Invariants
+from benchmarks.swarm.lines import Bus, Line
+from benchmarks.swarm.own_stars import turned_by
 from benchmarks.swarm.recorder import SwarmRecorder
 from benchmarks.swarm.service import SENDERS, SwarmService
 from benchmarks.swarm.telemetry_wire import Publisher, RemoteConsole, Subscriber

@@ -15,9 +15,9 @@ import numpy as np
 from benchmarks.swarm.commands import MOST_RATE_S
 from benchmarks.swarm.computer import Computer
 from benchmarks.swarm.computer import installed as computer_installed
+from benchmarks.swarm.happenings import Plan
 from benchmarks.swarm.instrument import RIGS, Instrument
 from benchmarks.swarm.invariants import NO_EXCEPTION, Violation
-from benchmarks.swarm.plan import Plan
 from benchmarks.swarm.recorder import installed as recorder_installed
 from benchmarks.swarm.service import installed as service_installed
 from benchmarks.swarm.telemetry_wire import drawn_subscribers

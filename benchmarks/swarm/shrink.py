@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import msgspec
 
+from benchmarks.swarm.happenings import Happening, Plan
 from benchmarks.swarm.invariants import Violation
-from benchmarks.swarm.plan import Happening, Plan
 from benchmarks.swarm.run import run_plan
 
 

@@ -1,6 +1,6 @@
 """Plans of the swarm that a test writes by hand."""
 
-from benchmarks.swarm.plan import Order, Plan
+from benchmarks.swarm.happenings import Order, Plan
 
 
 def plan(*happenings, duration_s=8.0, rig="fit-mock.toml", settings=()):

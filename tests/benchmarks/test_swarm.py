@@ -11,8 +11,9 @@ import pytest
 from benchmarks.swarm import __main__ as swarm_main
 from benchmarks.swarm import run as swarm_run
 from benchmarks.swarm.__main__ import finding, met, run_and_shrink, run_seed
+from benchmarks.swarm.happenings import Order, Plan, Strike
 from benchmarks.swarm.past import put_back
-from benchmarks.swarm.plan import Order, Plan, Strike, plan_of
+from benchmarks.swarm.plan import plan_of
 from benchmarks.swarm.run import run_plan
 from benchmarks.swarm.shrink import shrunk, shrunk_from
 from benchmarks.swarm.threads import (

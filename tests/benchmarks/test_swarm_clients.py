@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.swarm import plan as plans
 from benchmarks.swarm.clients import STEPS
-from benchmarks.swarm.plan import Cloud, FullDisk, RecorderDeath, Sequence
+from benchmarks.swarm.happenings import Cloud, FullDisk, RecorderDeath, Sequence
 from benchmarks.swarm.run import run_plan
 from benchmarks.swarm.service import SwarmService
 from fitctl.messages.commands import Acquire, Stop

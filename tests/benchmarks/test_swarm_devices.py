@@ -11,9 +11,9 @@ from benchmarks.swarm.devices.amplifiers import SwarmAmplifiers
 from benchmarks.swarm.devices.hexapod import SwarmHexapod
 from benchmarks.swarm.devices.mirror import SwarmDac, SwarmPiezo
 from benchmarks.swarm.devices.sensors import SwarmCamera, SwarmPhotodiodes
+from benchmarks.swarm.happenings import Order, Plan, Strike, kind_of
 from benchmarks.swarm.instrument import RIGS as FOLDER
 from benchmarks.swarm.lines import WRONG, Line
-from benchmarks.swarm.plan import Order, Plan, Strike, kind_of
 from benchmarks.swarm.run import run_plan
 from fitctl.config import load_rig
 from fitctl.drivers.interface import DeviceFault, DeviceMismatch, DeviceRefused, Pose

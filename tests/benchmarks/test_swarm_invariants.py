@@ -8,10 +8,10 @@ import pytest
 from samples.learner_reports import report
 
 from benchmarks.swarm.commands import LEARNT_DESIGNS
+from benchmarks.swarm.happenings import Order, Plan, Strike
 from benchmarks.swarm.invariants import NO_EXCEPTION
 from benchmarks.swarm.lines import FAULTS, WRONG
 from benchmarks.swarm.past import put_back
-from benchmarks.swarm.plan import Order, Plan, Strike
 from benchmarks.swarm.run import run_plan
 from benchmarks.swarm.service import SENDERS
 from fitctl.logging.records import ModeChange, RecorderStatus

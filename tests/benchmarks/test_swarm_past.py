@@ -2,8 +2,8 @@
 
 import pytest
 
+from benchmarks.swarm.happenings import Cloud, Kill, Stall, Strike
 from benchmarks.swarm.past import put_back
-from benchmarks.swarm.plan import Cloud, Kill, Stall, Strike
 from benchmarks.swarm.rigs import slow_servos
 from benchmarks.swarm.run import run_plan
 from fitctl.messages.commands import (

@@ -7,17 +7,10 @@ from typing import get_args
 import pytest
 
 from benchmarks.swarm.commands import LEARNT_DESIGNS
+from benchmarks.swarm.happenings import RESTARTS, Happening, Order, Strike, kind_of
 from benchmarks.swarm.instrument import RIGS as FOLDER
 from benchmarks.swarm.lines import FAULTS, WRONG
-from benchmarks.swarm.plan import (
-    DURATION_S,
-    RESTARTS,
-    Happening,
-    Order,
-    Strike,
-    drawn_plan,
-    kind_of,
-)
+from benchmarks.swarm.plan import DURATION_S, drawn_plan
 from benchmarks.swarm.rigs import (
     PHOTON_NOISE,
     RIGS,

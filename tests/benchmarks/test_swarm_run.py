@@ -8,7 +8,7 @@ from samples.learner_reports import report
 
 from benchmarks.swarm import plan as plans
 from benchmarks.swarm.commands import LEARNT_DESIGNS
-from benchmarks.swarm.plan import Kill, Strike
+from benchmarks.swarm.happenings import Kill, Strike
 from benchmarks.swarm.rigs import RIGS, SLOW, learning, slow_servos
 from benchmarks.swarm.run import run_plan
 from fitctl.logging.records import ControllerChange

@@ -4,7 +4,7 @@ import msgspec
 import pytest
 
 from benchmarks.swarm import service as swarm_service
-from benchmarks.swarm.plan import FullDisk, Kill, Order, Plan
+from benchmarks.swarm.happenings import FullDisk, Kill, Order, Plan
 from benchmarks.swarm.run import run_plan
 from fitctl.logging.records import Event
 from fitctl.messages.commands import Shutdown, Standby, Stop, TakeOver

@@ -3,7 +3,7 @@
 import msgspec
 import pytest
 
-from benchmarks.swarm.plan import Kill
+from benchmarks.swarm.happenings import Kill
 from benchmarks.swarm.run import run_plan
 from benchmarks.swarm.telemetry_wire import RemoteConsole
 from fitctl.messages import client

@@ -4,7 +4,7 @@ import msgspec
 import pytest
 
 from benchmarks.swarm.devices.amplifiers import SwarmAmplifiers
-from benchmarks.swarm.plan import Strike
+from benchmarks.swarm.happenings import Strike
 from benchmarks.swarm.rigs import RIGS
 from benchmarks.swarm.run import run_plan
 from fitctl.logging.records import Event
