@@ -7,6 +7,7 @@ import fcntl
 import hashlib
 import os
 import pwd
+import resource
 import signal
 import socket
 import struct
@@ -106,6 +107,13 @@ def give_way(niceness: int) -> None:
     if os.getsid(0) == os.getpid():
         with suppress(OSError):  # no autogroups
             Path("/proc/self/autogroup").write_text(str(niceness))
+
+
+def limit_memory(most_bytes: int) -> None:
+    """Let this process have so many bytes of data at most, or fewer where it may have no more."""
+    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    if hard == resource.RLIM_INFINITY or hard > most_bytes:
+        resource.setrlimit(resource.RLIMIT_DATA, (most_bytes, hard))
 
 
 @contextmanager

@@ -3,11 +3,20 @@
 import subprocess
 import sys
 
+import pytest
+
 GIVES_WAY = """
 import os
 from fitctl.processes import give_way
 give_way(7)
 print(os.nice(0))
+"""
+LIMITS = """
+import resource
+from fitctl.processes import limit_memory
+{before}
+limit_memory(700_000_000)
+print(resource.getrlimit(resource.RLIMIT_DATA)[0])
 """
 SHOWS_SESSION = "cat /proc/self/autogroup 2>&1 || true"
 LOWERS_SESSION = "(echo 7 > /proc/self/autogroup) 2>&1 || true"
@@ -47,3 +56,14 @@ def test_the_session_of_others_is_left_alone():
     output(sys.executable, "-c", GIVES_WAY)
 
     assert output("sh", "-c", SHOWS_SESSION) == before
+
+
+@pytest.mark.parametrize(
+    ("before", "limited"),
+    [
+        ("", 700_000_000),
+        ("resource.setrlimit(resource.RLIMIT_DATA, (650_000_000, 650_000_000))", 650_000_000),
+    ],
+)
+def test_a_process_limits_its_memory_unless_it_may_have_less(before, limited):
+    assert output(sys.executable, "-c", LIMITS.format(before=before)) == f"{limited}\n"

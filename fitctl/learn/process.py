@@ -5,7 +5,6 @@ It has no part in the loop. Without it nothing is learnt, and nothing else chang
 
 from __future__ import annotations
 
-import resource
 import threading
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
@@ -21,13 +20,13 @@ from fitctl.loop.learning import is_other_light
 from fitctl.messages.client import Client
 from fitctl.messages.commands import LearnerReport
 from fitctl.messages.telemetry import LoopState, Telemetry
-from fitctl.processes import give_way
+from fitctl.processes import give_way, limit_memory
 
 Floats = NDArray[np.float64]
 NICENESS = 10
 """With 19, a learner on a busy machine gets too little of the processor to follow the telemetry at all."""
 MOST_BYTES = 1 << 30
-"""Of the process's own data. Beyond it, the process ends, and the supervisor starts a new one."""
+"""Of the process's own data. Beyond it, a report fails, or the process ends and is started again."""
 _POLL_S = 0.5
 
 
@@ -89,9 +88,7 @@ class LoopLearner:
 def serve_learning(client: Client, rig: Rig, stop: threading.Event) -> None:
     """Learn from a supervisor's telemetry until `stop`."""
     give_way(NICENESS)
-    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
-    most = MOST_BYTES if hard == resource.RLIM_INFINITY else min(MOST_BYTES, hard)
-    resource.setrlimit(resource.RLIMIT_DATA, (most, most))
+    limit_memory(MOST_BYTES)
     learners = {
         name: LoopLearner(rig, name)
         for name, loop in rig.stellar_loops.items()

@@ -284,8 +284,7 @@ class _Block:
         }
         self._header = [self._values[name] for name in HEADER]
         self._fields = [(name, self._values[name]) for name in form]
-        self._texts = [self._values[name] for name in form if self._dtypes[name] is np.str_]
-        self._longest = 0
+        self._longest = {name: 0 for name in form if self._dtypes[name] is np.str_}
 
     def __len__(self) -> int:
         return len(self._header[0])
@@ -293,7 +292,7 @@ class _Block:
     @property
     def characters(self) -> int:
         """Room for the longest text in every row."""
-        return self._longest * len(self)
+        return max(self._longest.values(), default=0) * len(self)
 
     def add(self, entry: LogMessage) -> None:
         times_ns = (entry.log_time_ns, entry.publish_time_ns, entry.sequence)
@@ -301,20 +300,18 @@ class _Block:
             column.append(value)
         for name, column in self._fields:
             column.append(getattr(entry.message, name))
-        for column in self._texts:
-            self._longest = max(self._longest, len(column[-1]))
+        for name, longest in self._longest.items():
+            self._longest[name] = max(longest, len(self._values[name][-1]))
 
     def columns(self, what: str) -> Columns:
         """Its columns; an array of texts has room for the longest one in every row."""
-        for name, values in self._values.items():
-            if self._dtypes[name] is np.str_:
-                longest = max(map(len, values), default=0)
-                if longest * len(values) > _MOST_CHARACTERS:
-                    msg = (
-                        f"{what}: a {name} has {longest} characters; expected texts as fitctl records them; "
-                        "choose other topics, or cut that time out with `fitctl log cut`"
-                    )
-                    raise LogError(msg)
+        for name, longest in self._longest.items():
+            if longest * len(self) > _MOST_CHARACTERS:
+                msg = (
+                    f"{what}: a {name} has {longest} characters; expected texts as fitctl records them; "
+                    "choose other topics, or cut that time out with `fitctl log cut`"
+                )
+                raise LogError(msg)
         return {
             name: np.array(values, dtype=self._dtypes[name])
             for name, values in self._values.items()

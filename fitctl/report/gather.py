@@ -205,13 +205,14 @@ def gather(run: Run) -> Gathered:
             if topic in series:
                 filled[topic] += _fill(rooms[topic], filled[topic], columns, time_s, str(log.path))
                 continue
-            whole = _whole(places[topic][0], columns, str(log.path)) | {"time_s": time_s}
-            if places[topic][0] in {"timing", "recorder"}:
-                blocks[places[topic]].append(whole)
-            elif places[topic][0] == "health":  # says the same every second, all night
-                rows[places[topic]] += _changes(_rows(whole), states)
+            place = name, _ = places[topic]
+            whole = _whole(name, columns, str(log.path)) | {"time_s": time_s}
+            if name in {"timing", "recorder"}:
+                blocks[place].append(whole)
+            elif name == "health":  # says the same every second, all night
+                rows[place] += _changes(_rows(whole), states)
             else:
-                rows[places[topic]] += _rows(whole)
+                rows[place] += _rows(whole)
     for topic, room in rooms.items():
         room.update({name: column[: filled[topic]] for name, column in room.items()})
         _in_order(room)

@@ -73,7 +73,7 @@ def find_run(paths: Sequence[Path], rig: Rig | None = None, overrides: Sequence[
         If the rig in the log is none that this fitctl understands, or the given one has other loops or frames.
     """
     unreadable: tuple[str, ...] = ()
-    if len(paths) == 1 and os.path.isdir(paths[0]):
+    if len(paths) == 1 and os.path.isdir(paths[0]):  # and can be examined
         folder = paths[0]
         paths, unreadable = find_newest(folder)
         if not paths:

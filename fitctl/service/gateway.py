@@ -25,7 +25,7 @@ from fitctl.logging.records import Severity
 from fitctl.messages.commands import Reply
 from fitctl.messages.endpoints import GATEWAY_SOCKET, TELEMETRY_SOCKET, SocketFolder
 from fitctl.messages.keys import AllowedKey
-from fitctl.processes import give_way
+from fitctl.processes import give_way, limit_memory
 from fitctl.service.doors import MESSAGES_A_ROUND, QUEUED, ROUND_MS, Parcel, frame_property
 from fitctl.service.envelope import Passed, Report
 from fitctl.service.intake import Intake, Limit
@@ -57,9 +57,7 @@ def be_modest() -> None:
     Of threads that exist already it speaks to this one alone, so it is for the beginning of a process.
     """
     give_way(_NICENESS)
-    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
-    if hard == resource.RLIM_INFINITY or hard > _MOST_BYTES:
-        resource.setrlimit(resource.RLIMIT_DATA, (_MOST_BYTES, hard))
+    limit_memory(_MOST_BYTES)
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))  # each stranger is one for a while
 

@@ -3,7 +3,7 @@ import math
 
 import numpy as np
 import pytest
-from samples.forged_logs import forged
+from samples.forged_logs import forged, with_values
 from samples.learner_reports import LINE, report
 from samples.report_samples import record
 
@@ -215,18 +215,8 @@ def test_frames_that_were_lost_once_are_counted_once_and_one_second_without_serv
 
 
 def test_a_target_that_is_not_known_where_the_star_is_held_is_refused(held, tmp_path):
-    path = forged_of_held(held[1], tmp_path / "target.mcap", target_az_px=math.nan)
+    topic = TOPICS[Tick].format(loop="right")
+    path = with_values(held[1], tmp_path / "target.mcap", topic, target_az_px=math.nan)
 
     with pytest.raises(LogError, match="target_az_px"):
         find(find_run([path]))
-
-
-def forged_of_held(source, target, **values):
-    """The log of a held star, where every tick has these values."""
-
-    def change(entry):
-        if entry.topic == TOPICS[Tick].format(loop="right"):
-            for name, value in values.items():
-                setattr(entry.message, name, value)
-
-    return forged(source, target, change)

@@ -48,13 +48,18 @@ def forged(source, target, change, add=lambda _: None):
 
 def forged_of(records, target, topic, **values):
     """A log of sample records, where every message of a topic has these values."""
+    source = write_log(target.with_name("as_recorded.mcap"), records)
+    return with_values(source, target, topic, **values)
+
+
+def with_values(source, target, topic, **values):
+    """Copy a log; every message of a topic has these values in the copy."""
 
     def change(record):
         if record.topic == topic:
             for name, value in values.items():
                 setattr(record.message, name, value)
 
-    source = write_log(target.with_name("as_recorded.mcap"), records)
     return forged(source, target, change)
 
 

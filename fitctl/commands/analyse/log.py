@@ -67,18 +67,17 @@ def list_(rig: RigOption = None, overrides: SetOption = None, as_json: JsonOptio
     """
     where = logging_rig("log list", rig, overrides).logging.folder_path
     found, problems = logs_in(where)
-    sizes = {log.path: _size(log.path) for log in found}
-    logs = [log for log in found if sizes[log.path] is not None]
+    logs = [(log, size) for log in found if (size := _size(log.path)) is not None]
     if as_json:
-        say(to_json([_listed(log, sizes[log.path]) for log in logs]))
+        say(to_json([_listed(log, size) for log, size in logs]))
     elif not logs:
         say(f"{where}: no logs")
     else:
-        for log in logs:
+        for log, size in logs:
             begin = time.strftime("%Y-%m-%d %H:%M:%S UTC", time.gmtime(log.start_s))
             span = f"{begin}  {log.duration_s:9.1f} s" if log.counts else "without any record"
-            size = f"{(sizes[log.path] or 0) / 1e6:9.1f} MB"
-            say(f"{log.path}  {span:<36}  {size}  {rig_name(log)}, {_state(log.path, log)}")
+            of = f"{rig_name(log)}, {_state(log.path, log)}"
+            say(f"{log.path}  {span:<36}  {size / 1e6:9.1f} MB  {of}")
     for problem in problems.values():
         say(str(problem), err=True)
     raise typer.Exit(FAILED if problems else 0)
@@ -92,7 +91,7 @@ def _size(log: Path) -> int | None:
         return None
 
 
-def _listed(found: LogInfo, size: int | None) -> dict[str, object]:
+def _listed(found: LogInfo, size: int) -> dict[str, object]:
     document = _info_document(
         found, size, kept=folder.is_kept(found.path), recording=folder.in_use(found.path)
     )

@@ -90,7 +90,7 @@ def design(
     if out is not None and out.suffix != ".json":
         msg = f"design {what}: --out {out}: must end in .json, or no rig file can name it"
         raise ConfigError(msg)
-    if out is not None and os.path.exists(out) and not overwrite:
+    if out is not None and os.path.exists(out) and not overwrite:  # if it can be examined
         msg = f"design {what}: --out {out}: exists already; give another name, or pass --overwrite"
         raise ConfigError(msg)
     name = "lqg-ltr" if what == "vernier" else what

@@ -188,9 +188,8 @@ def night_of(design: Design, rig_basis: Basis) -> Basis:
 
 
 _QUOTED = 60  # characters of a value that cannot be
-_MOST_LINES = (
-    32  # a design takes a time that grows with their cube; the learner finds eight at most
-)
+# A design for 100 lines took six seconds, one for 300 more than a minute. The learner finds eight at most.
+_MOST_LINES = 32
 
 
 class _Line(Settings):
