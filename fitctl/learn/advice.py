@@ -126,8 +126,8 @@ class Advice(NamedTuple):
     Attributes
     ----------
     night : Night
-    measured_px : tuple of float
-        RMS of the error on frames, az and el.
+    measured_px : tuple of float, or None
+        RMS of the error on frames under the present design, az and el; None without such frames.
     present, learnt : Standing
     bound_px : float
     more_writes_px : float
@@ -152,7 +152,7 @@ class Advice(NamedTuple):
     """
 
     night: Night
-    measured_px: tuple[float, float]
+    measured_px: tuple[float, float] | None
     present: Standing
     learnt: Standing
     bound_px: float
@@ -228,8 +228,7 @@ class Advice(NamedTuple):
             *([] if self.lines else ["lines        none"]),
             *self._alias_hint(),
             f"test of fit  {night.test.text}",
-            f"measured     {' '.join(f'{a} {px:.4f}' for a, px in zip(_AXES, self.measured_px, strict=True))}"
-            " px RMS on frames, noise included",
+            self._measured_text(),
             f"{'':13}true px    on frames  of bound  peak  gain m.  phase m.",
             _standing_text("present", self.present, self.bound_px),
             _standing_text("learnt", self.learnt, self.bound_px),
@@ -305,6 +304,12 @@ class Advice(NamedTuple):
             return ""
         return f"; {self.filled} frames are missing or met a late command, and were filled"
 
+    def _measured_text(self) -> str:
+        if self.measured_px is None:
+            return "measured     no frames under the present design"
+        sizes = " ".join(f"{a} {px:.4f}" for a, px in zip(_AXES, self.measured_px, strict=True))
+        return f"measured     {sizes} px RMS on frames under the present design, noise included"
+
     def _gain_text(self) -> str:
         if self.night.mirror_gain.covers(1.0):
             return ""
@@ -325,7 +330,7 @@ class Advice(NamedTuple):
             "overshoot": night.overshoot._asdict(),
             "lines": [_line_numbers(line) for line in self.lines],
             "test": night.test._asdict() | {"fits": night.test.fits},
-            "measured_px": dict(zip(_AXES, self.measured_px, strict=True)),
+            "measured_px": self.measured_px and dict(zip(_AXES, self.measured_px, strict=True)),
             "present": _standing_numbers(self.present),
             "learnt": _standing_numbers(self.learnt),
             "bound_px": self.bound_px,
@@ -334,13 +339,14 @@ class Advice(NamedTuple):
             "shown_gain_px": dict(zip(_DESIGNS, self.shown_px, strict=True)),
             "without_lines_px": dict(zip(_DESIGNS, self.without_lines_px, strict=True)),
             "if_aliases_px": dict(zip(_DESIGNS, self.if_aliases[:2], strict=True)),
+            "classifying_rate_hz": self.classifying_rate_hz,
             "worth_it": self.worth_it,
         }
 
 
 def advise(
     series: list[Series],
-    measured_px: tuple[float, float],
+    measured_px: tuple[float, float] | None,
     rig_basis: Basis,
     present: Design,
     required: Required | None = None,
@@ -354,8 +360,8 @@ def advise(
     ----------
     series : list of Series
         The loop, opened: :func:`fitctl.learn.opened.rebuild`.
-    measured_px : tuple of float
-        RMS of the error on the same frames, az and el.
+    measured_px : tuple of float, or None
+        RMS of the error on those frames that came under `present`, az and el.
     rig_basis : Basis
         What the rig file has of the loop: the estimate begins there.
     present : Design

@@ -30,14 +30,22 @@ def estimated(
     Raises
     ------
     ConfigError
-        If there is too little of it, or the mirror hardly moves.
+        If there is too little of it, no air path explains it, or the mirror hardly moves.
     """
     opened = periodograms(series, rig_basis.period_s)
     if opened is None:
-        longest_s = max((len(one.disturbance_px) for one in series), default=0) * rig_basis.period_s
+        longest_s, rate_hz = _longest_s(series, rig_basis.period_s), 1 / rig_basis.period_s
+        other_hz = {
+            1 / at.period_s for at in others if _longest_s(at.series, at.period_s) >= LEAST_S
+        }
+        instead = "give a longer log"
+        if other_hz:
+            rates = " and ".join(f"{hz:.4g}" for hz in sorted(other_hz))
+            instead = f"there is more at {rates} Hz: give that as --set camera.frame_rate_hz"
         msg = (
-            f"learn: the longest piece in VERNIER is {longest_s:.0f} s, from where it has settled; expected at "
-            f"least {LEAST_S:.0f} s, preferably two minutes, with a star held on its target; give a longer log"
+            f"learn: the longest piece in VERNIER at {rate_hz:.4g} Hz is {longest_s:.0f} s, from where it has "
+            f"settled; expected at least {LEAST_S:.0f} s, preferably two minutes, with a star held on its "
+            f"target; {instead}"
         )
         raise ConfigError(msg)
     night = estimate(opened, rig_basis.air_path, rig_basis.noise_px)
@@ -58,6 +66,10 @@ def estimated(
         overshoot=_overshoot_for_design(night),
     )
     return night, truth, classified
+
+
+def _longest_s(series: Sequence[Series], period_s: float) -> float:
+    return max((len(one.disturbance_px) for one in series), default=0) * period_s
 
 
 def _at_hz(night: Night, classified: Sequence[Classified]) -> dict[LearntLine, float]:

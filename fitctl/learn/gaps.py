@@ -14,6 +14,7 @@ from scipy.sparse.linalg import spsolve
 Floats = NDArray[np.float64]
 _ORDER = 60
 _ROUNDS = 4
+_AT_ONCE = 4096  # windows that are copied; all of a night's would need 60 times its memory
 _ENOUGH = 2  # known frames for each coefficient; with fewer, straight lines have to do
 
 
@@ -61,8 +62,12 @@ def _filled(column: Floats, known: NDArray[np.bool_], draw: np.random.Generator)
 
 def _of_window(series: Floats) -> Floats:
     """Factors of `_ORDER` frames and the one after them in the error of its prediction."""
-    before = np.ascontiguousarray(np.lib.stride_tricks.sliding_window_view(series, _ORDER)[:-1])
-    weights = np.linalg.lstsq(before.T @ before, before.T @ series[_ORDER:], rcond=None)[0]
+    windows = np.lib.stride_tricks.sliding_window_view(series, _ORDER + 1)
+    products = np.zeros((_ORDER + 1, _ORDER + 1))
+    for first in range(0, len(windows), _AT_ONCE):
+        some = windows[first : first + _AT_ONCE].copy()
+        products += some.T @ some
+    weights = np.linalg.lstsq(products[:-1, :-1], products[:-1, -1], rcond=None)[0]
     return np.append(-weights, 1.0)
 
 

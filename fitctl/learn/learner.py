@@ -132,43 +132,40 @@ class Learner:
         """There are enough new frames for a report."""
         return self._new >= self._due_after
 
-    def newest(self) -> Floats:
-        """A copy of the frames that are kept, the oldest first, for :meth:`report` on another thread."""
+    def begin_report(self) -> Floats:
+        """Count the time to the next report from now.
+
+        Returns
+        -------
+        array, shape (frames, fields)
+            A copy of the frames that are kept, the oldest first, for :meth:`report` on another thread.
+        """
+        self._new, self._due_after = 0, round(EVERY_S / self._period_s)
         oldest = self._added % len(self._ring) if self._added > len(self._ring) else 0
         return np.roll(self._ring[: self.frames], -oldest, axis=0)
 
-    def report(self, present: Design, frames: Floats | None = None) -> LearnerReport:
+    def report(self, present: Design, frames: Floats) -> LearnerReport:
         """Estimate and design, with `present` in force; a report without a result has the reason.
 
-        `frames` is the copy that the caller made with :meth:`newest`; by default this makes one.
+        `frames` are those with which :meth:`begin_report` began it.
         """
-        self._begin_report()
-        table = self.newest() if frames is None else frames
         try:
             with solving("learn", self._loop_name, "the next report may have one"):
-                return self._report(self._advice(present, table))
+                return self._report(self._advice(present, frames))
         except ConfigError as error:
-            return self._without_design(str(error))
+            return self.failed(str(error), frames)
         except MemoryError:
-            return self._without_design(
-                "learn: the learner's process has too little memory for a report"
-            )
+            reason = "learn: the learner's process has too little memory for a report"
+            return self.failed(reason, frames)
 
-    def failed(self, reason: str) -> LearnerReport:
+    def failed(self, reason: str, frames: Floats) -> LearnerReport:
         """Instead of :meth:`report`, where the design in force is not known."""
-        self._begin_report()
-        return self._without_design(reason)
-
-    def _without_design(self, reason: str) -> LearnerReport:
         return LearnerReport(
             loop=self._loop_name,
             design_json="",
             text=reason,
-            evaluated_s=self.frames * self._period_s,
+            evaluated_s=len(frames) * self._period_s,
         )
-
-    def _begin_report(self) -> None:
-        self._new, self._due_after = 0, round(EVERY_S / self._period_s)
 
     def _advice(self, present: Design, table: Floats) -> Advice:
         ticks = dict(zip(_KEPT, table.T, strict=True))
@@ -178,14 +175,10 @@ class Learner:
         error_px = np.stack([ticks["error_az_px"], ticks["error_el_px"]], axis=-1)
         usual = joined(pieces)
         own = error_px[usual][ticks["time_s"][usual] >= self._since_s + SETTLE_S]
-        az_px, el_px = (
-            np.sqrt(np.mean(own**2, axis=0)).tolist()
-            if len(own) * self._period_s >= LEAST_S
-            else (0.0, 0.0)
-        )
+        enough = len(own) * self._period_s >= LEAST_S
         advice = advise(
             rebuild(theory, ticks, pieces),
-            (az_px, el_px),
+            tuple(np.sqrt(np.mean(own**2, axis=0)).tolist()) if enough else None,
             basis(self._rig, self._loop_name),
             present,
             like=self._learnt,
@@ -212,7 +205,7 @@ class Learner:
             learnt_px=advice.learnt.residual_px,
             bound_px=advice.bound_px,
             learnt_camera_px=advice.learnt.camera_px,
-            measured_px=max(advice.measured_px),
+            measured_px=max(advice.measured_px or (0.0,)),
             noise_px=advice.night.noise_px.value,
             worth_it=advice.worth_it,
             fits=advice.night.test.fits,

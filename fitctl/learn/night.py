@@ -15,9 +15,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 from scipy.ndimage import uniform_filter1d
 
-from fitctl.config import AirPathModel
+from fitctl.config import AirPathModel, ConfigError
 from fitctl.controllers.design.basis import Line
 from fitctl.controllers.design.linear_loop.spectrum import air_of, seen_at_hz
 from fitctl.learn.goodness_of_fit import FitTest, fit_test
@@ -130,6 +131,11 @@ def estimate(opened: Opened, expected: AirPathModel, noise_px: float) -> Night:
         Where the search begins,
     noise_px : float
         with the sensor's noise.
+
+    Raises
+    ------
+    ConfigError
+        If no air path explains the frames, such as those of a star that stands still.
     """
     # Lines first, with the mirror as the rig file has it: it would explain a line that the model lacks. Then
     # with the mirror free, lines that explained the mirror are no longer worth their price.
@@ -160,6 +166,7 @@ def estimate_with_aliases(opened: Opened, night: Night, at_hz: Mapping[LearntLin
     """The likeliest night near another, with its lines where they are, some above half the frame rate.
 
     Frames show their tails otherwise than those of a slow line, for which air, mirror and noise make up.
+    Raises as :func:`estimate` does.
     """
     return _night(opened, likeliest(opened, guess_of(night, at_hz.items())))
 
@@ -263,7 +270,7 @@ def _night(opened: Opened, found: Likeliest) -> Night:
         for at in [_FIRST_LINE + number * (2 + axes)]
     ]
     lines.sort(key=lambda line: -max(rms.value for rms in line.rms_px))
-    return Night(
+    night = Night(
         gain_px=combined(strength=1, stiffness=-1),
         b1_s2=combined(stiffness=-1),
         b2_s=combined(damping=1, stiffness=-1),
@@ -276,6 +283,16 @@ def _night(opened: Opened, found: Likeliest) -> Night:
         test=fit_test(opened, found.density, guess.gain, guess.overshoot),
         duration_s=opened.duration_s,
     )
+    try:
+        _ = night.air_path
+    except ValidationError:
+        msg = (
+            f"learn: no air path explains these frames: gain {night.gain_px.value:.4g} px, b1 "
+            f"{night.b1_s2.value:.4g} s², b2 {night.b2_s.value:.4g} s; expected a star that air moves, on "
+            "frames with noise; look at the error with fitctl plot"
+        )
+        raise ConfigError(msg) from None
+    return night
 
 
 _INDEX = {

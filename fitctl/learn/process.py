@@ -68,7 +68,7 @@ class LoopLearner:
             (future, key), self._report = self._report, None
             ready = future.result() if key == self._key else None
         if self._report is None and self._state is not None and self._learner.due:
-            begun = executor.submit(self._make, self._state, self._learner.newest())
+            begun = executor.submit(self._make, self._state, self._learner.begin_report())
             self._report = begun, self._key
         return ready
 
@@ -76,12 +76,13 @@ class LoopLearner:
         try:
             present = design_for(self._rig, self.loop_name, state.design, state.noise_px)
         except ConfigError as error:  # such as a design file that is gone
-            return self._learner.failed(str(error))
+            return self._learner.failed(str(error), frames)
         if state.controller_digest not in {"", present.digest}:
-            return self._learner.failed(
+            reason = (
                 f"{state.controller_file} has changed since the loop loaded it; to learn, load it again with "
                 "fitctl send controller"
             )
+            return self._learner.failed(reason, frames)
         return self._learner.report(present, frames)
 
 

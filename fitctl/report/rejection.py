@@ -188,9 +188,15 @@ def last_design(gathered: Gathered, loop_name: str) -> Design:
     ConfigError
         If its matrices are not in the log and cannot be made again.
     """
-    every = _in_force(gathered, loop_name)
-    its = [one for one in every if one.title == every[-1].title]
+    its = _last_in_force(gathered, loop_name)
     return _design(gathered, loop_name, its, basis(gathered.run.rig, loop_name))
+
+
+def under_last_design(gathered: Gathered, loop_name: str) -> NDArray[np.bool_]:
+    """Whether :func:`last_design` was in force, shape (ticks,)."""
+    time_s = gathered.ticks[loop_name]["time_s"]
+    its = _last_in_force(gathered, loop_name)
+    return np.any([(time_s >= one.begin_s) & (time_s < one.end_s) for one in its], axis=0)
 
 
 class _InForce(NamedTuple):
@@ -221,6 +227,11 @@ def _in_force(gathered: Gathered, loop_name: str) -> list[_InForce]:
         title = its if number == 1 else f"{its} ({number})"
         found.append(_InForce(begin_s, end_s, plain(title), plain(its), design))
     return found
+
+
+def _last_in_force(gathered: Gathered, loop_name: str) -> list[_InForce]:
+    every = _in_force(gathered, loop_name)
+    return [one for one in every if one.title == every[-1].title]
 
 
 def _within(

@@ -186,7 +186,8 @@ class Simulation:
             title = loop.learning.design_json or design.title
             learner.watch(f"{title} {loop.noise_px}", self.clock.now_s())
             if learner.due:
-                self.supervisor.post(learner.report(design), lambda _: None)
+                report = learner.report(design, learner.begin_report())
+                self.supervisor.post(report, lambda _: None)
 
     def acquire(self) -> None:
         """Power up and begin the search.

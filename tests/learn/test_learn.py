@@ -10,12 +10,14 @@ import pytest
 from benchmarks.linear_loop import course_px, held
 from fitctl.config import ConfigError
 from fitctl.controllers.design.basis import Line
+from fitctl.controllers.design.choose import solving
 from fitctl.controllers.design.linear_loop.bound import bound, linear_residual
 from fitctl.controllers.design.linear_loop.spectrum import Air, air_of, framed_line_slopes
 from fitctl.controllers.design.margins import Required, design_with_margins, margins
 from fitctl.learn.advice import advise
 from fitctl.learn.aliases import IfAliases
 from fitctl.learn.design_basis import estimated
+from fitctl.learn.frame_rates import AtOtherRate
 from fitctl.learn.goodness_of_fit import FitTest, fit_test
 from fitctl.learn.intervals import Interval
 from fitctl.learn.night import _without_needless_lines, estimate
@@ -426,9 +428,18 @@ def test_advice_is_the_same_for_people_and_for_programs(six_hz):
         assert f"{value:.4f}" in text
     assert numbers["lines"][0]["frequency_hz"]["value"] == pytest.approx(6.0, abs=0.05)
     assert numbers["worth_it"]
+    assert numbers["classifying_rate_hz"] == advice.classifying_rate_hz
+    assert f"measured     az {numbers['measured_px']['az']:.4f}" in text
     assert numbers["without_lines_px"]["learnt"] == advice.without_lines_px[1]
     for reason in ("lately_px", "shown_gain_px", "if_aliases_px"):
         assert numbers[reason]["learnt"] < numbers[reason]["present"]
+
+
+def test_without_a_frame_under_the_present_design_its_error_is_not_a_number(six_hz):
+    unknown = six_hz[1]._replace(measured_px=None)
+
+    assert unknown.numbers()["measured_px"] is None
+    assert "measured     no frames under the present design" in unknown.lines_of_text()
 
 
 def test_too_short_a_hold_is_an_error(paper, fixed):
@@ -436,9 +447,29 @@ def test_too_short_a_hold_is_an_error(paper, fixed):
 
     with pytest.raises(
         ConfigError,
-        match="longest piece in VERNIER is 10 s, from where it has settled; expected at least 20 s",
+        match="longest piece in VERNIER at 50 Hz is 10 s, from where it has settled; expected at least 20 s",
     ):
         advise([series], (0.01, 0.01), paper, fixed)
+
+
+def test_frames_at_another_rate_than_the_rig_files_are_an_error_that_names_both(paper, fixed):
+    slower = dataclasses.replace(paper, period_s=1 / 47.0)
+    _, series = held(slower, fixed, 60.0, seed=0)
+
+    with pytest.raises(
+        ConfigError, match=r"at 50 Hz is 0 s.*there is more at 47 Hz.*frame_rate_hz"
+    ):
+        advise([], (0.0, 0.0), paper, fixed, others=[AtOtherRate(slower.period_s, [series])])
+
+
+def test_a_star_that_stands_still_is_an_error_of_one_line(paper, fixed):
+    still = Series(np.zeros((3000, 2)), np.zeros((3000, 2)))
+
+    with (
+        pytest.raises(ConfigError, match=r"^learn: no air path explains these frames.*$"),
+        solving("learn", "right"),
+    ):
+        advise([still], (0.0, 0.0), paper, fixed)
 
 
 def test_a_mirror_that_moves_less_gets_a_design_that_commands_more(paper, fixed):

@@ -2,6 +2,7 @@
 
 import json
 from concurrent.futures import ThreadPoolExecutor
+from threading import Event
 
 import msgspec
 import numpy as np
@@ -106,7 +107,7 @@ def test_a_long_night_is_learnt_from_its_last_minutes_in_as_much_memory(rig, ver
         at_s += PERIOD_S
         tick = vernier[number % len(vernier)]
         learner.add(msgspec.structs.replace(tick, time_s=at_s, mid_exposure_s=at_s))
-    report = learner.report(design_for(rig, "right"))
+    report = learner.report(design_for(rig, "right"), learner.begin_report())
 
     assert learner.frames == frames
     assert learner._ring.nbytes == before
@@ -117,7 +118,7 @@ def test_a_long_night_is_learnt_from_its_last_minutes_in_as_much_memory(rig, ver
 def test_a_report_has_the_night_and_a_design_that_can_be_made_again(rig, ticks):
     learner = fed(rig, ticks)
     learner.watch("minimum-variance", 0.0)
-    report = learner.report(design_for(rig, "right"))
+    report = learner.report(design_for(rig, "right"), learner.begin_report())
 
     assert report.worth_it
     assert "6.0" in report.text
@@ -137,11 +138,12 @@ def test_most_lines_still_fit_into_a_command():
 
 
 def test_without_a_long_enough_piece_the_report_says_so(rig, vernier):
-    report = fed(rig, vernier[:300]).report(design_for(rig, "right"))
+    learner = fed(rig, vernier[:300])
+    report = learner.report(design_for(rig, "right"), learner.begin_report())
 
     assert not report.design_json
     assert not report.worth_it
-    assert "the longest piece in VERNIER is" in report.text
+    assert "the longest piece in VERNIER at 50 Hz is" in report.text
 
 
 @pytest.mark.long
@@ -224,6 +226,28 @@ def test_another_light_of_the_star_begins_a_new_night(rig, vernier, monkeypatch)
     assert learner._learner.due
 
 
+def test_a_new_night_begins_while_a_report_waits_for_that_of_another_loop(
+    rig, vernier, monkeypatch
+):
+    """One thread makes the reports of all loops. The first of the new night is due after the longer time."""
+    monkeypatch.setattr("fitctl.learn.learner.FIRST_S", 1.0)
+    monkeypatch.setattr("fitctl.learn.learner.EVERY_S", 0.2)
+    learner = LoopLearner(rig, "right")
+    heard = message(vernier[:500])
+    learner.hear(heard, heard.loops[0])
+    other_is_done = Event()
+    with ThreadPoolExecutor(1) as executor:
+        executor.submit(other_is_done.wait, 60.0)
+        learner.work(executor)
+        dimmer = message([], noise_px=0.036)
+        learner.hear(dimmer, dimmer.loops[0])
+        other_is_done.set()
+    soon = message(vernier[500:525], noise_px=0.036)
+    learner.hear(soon, soon.loops[0])
+
+    assert not learner._learner.due
+
+
 def test_a_report_for_which_memory_does_not_suffice_says_so(rig, vernier, monkeypatch):
     def too_large(*_):
         raise MemoryError
@@ -303,7 +327,7 @@ def test_a_star_that_a_command_says_to_move_is_no_disturbance():
 @pytest.mark.long
 def test_reports_follow_each_other_by_their_time(rig, vernier):
     learner = fed(rig, vernier)
-    learner.report(design_for(rig, "right"))
+    learner.report(design_for(rig, "right"), learner.begin_report())
     frames = round(EVERY_S / PERIOD_S)
     later = [msgspec.structs.replace(tick, time_s=tick.time_s + 100.0) for tick in vernier[:frames]]
     for tick in later[:-1]:

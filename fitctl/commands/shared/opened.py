@@ -14,7 +14,7 @@ from fitctl.identify.record import axis_pair
 from fitctl.learn.frame_rates import AtOtherRate, by_rate, joined
 from fitctl.learn.opened import Series, rebuild
 from fitctl.report.gather import Gathered
-from fitctl.report.rejection import last_design
+from fitctl.report.rejection import last_design, under_last_design
 from fitctl.report.selection import Selection, select_frames
 
 
@@ -28,8 +28,8 @@ class OpenedLoop(NamedTuple):
         What was recorded at other frame rates than the rig file's.
     selection : Selection
         The frames of it; those at which the stages were held are no part of the series.
-    measured_px : tuple of float
-        RMS of the error on the series' frames, az and el.
+    measured_px : tuple of float, or None
+        RMS of the error on the series' frames under the present design, az and el; None without any.
     present : Design
         That was in force at the end.
     """
@@ -37,7 +37,7 @@ class OpenedLoop(NamedTuple):
     series: list[Series]
     others: list[AtOtherRate]
     selection: Selection
-    measured_px: tuple[float, float]
+    measured_px: tuple[float, float] | None
     present: Design
 
 
@@ -60,12 +60,13 @@ def opened_loop(gathered: Gathered, loop_name: str) -> OpenedLoop:
     pieces, others = by_rate(exposed_s, pieces_of(exposed_s, usable), rig.camera.period_s)
     theory = loop_theory(rig, loop_name, present)
     mirror_rad = mirror_at_exposure_rad(loop.fsm, ticks)
-    error_px = axis_pair(ticks, "error_{}_px")[joined(pieces)]
-    az_px, el_px = np.sqrt(np.mean(error_px**2, axis=0)).tolist() if len(error_px) else (0.0, 0.0)
+    rows = joined(pieces)
+    rows = rows[under_last_design(gathered, loop_name)[rows]]
+    error_px = axis_pair(ticks, "error_{}_px")[rows]
     return OpenedLoop(
         rebuild(theory, ticks, pieces, mirror_rad),
         [AtOtherRate(s, rebuild(theory, ticks, [rows], mirror_rad)) for s, rows in others],
         selection,
-        (az_px, el_px),
+        tuple(np.sqrt(np.mean(error_px**2, axis=0)).tolist()) if len(rows) else None,
         present,
     )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
+import json
 import os
 from pathlib import Path
 from typing import Any
@@ -59,6 +60,17 @@ def own_design(path: Path, its_basis: Basis) -> Design:
             f"returned {type(made).__name__}"
         )
         raise ConfigError(msg)
+    try:
+        json.dumps(made.parameters)
+    except (TypeError, ValueError, RecursionError) as error:
+        msg = (
+            f"controller {path}: parameters must be numbers, texts, lists and dicts, which logs can hold: "
+            f"{plain(str(error))}; of an array, use .tolist()"
+        )
+        raise ConfigError(msg) from None
+    if not isinstance(made.parameters, dict):
+        msg = f"controller {path}: parameters must be a dict, is {type(made.parameters).__name__}"
+        raise ConfigError(msg)
     design = dataclasses.replace(made, name=name, own=True, file=str(path.absolute()))
     return checked(design, its_basis, str(path))
 
@@ -99,7 +111,7 @@ def checked(design: Design, its_basis: Basis, origin: str) -> Design:
     except (TypeError, ValueError) as error:
         msg = f"controller {origin}: a, b, c, d must be matrices of numbers: {error}"
         raise ConfigError(msg) from None
-    for key, shape in matrix_shapes(len(matrices["a"])).items():
+    for key, shape in matrix_shapes(len(np.atleast_1d(matrices["a"]))).items():
         if matrices[key].size == 0 == np.prod(shape):
             matrices[key] = matrices[key].reshape(shape)
         if matrices[key].shape != shape:

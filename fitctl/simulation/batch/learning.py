@@ -216,7 +216,8 @@ class _Loop:
         self._learner.add(shown)
         self._learner.watch(self.learning.design_json or pointing.design.title, shown.time_s)
         if self._learner.due:
-            self._report = self._learner.report(pointing.design)
+            frames = self._learner.begin_report()
+            self._report = self._learner.report(pointing.design, frames)
 
     def _designed(self, number: int, now_s: float, report: LearnerReport) -> list[Change]:
         """As the supervisor has it made and used; none if it is rejected."""

@@ -85,7 +85,7 @@ def test_a_controller_that_is_none_is_blamed_on_its_option(replay, log):
 def test_a_log_too_short_for_an_expected_rms_says_so(replay, log):
     _, text, _ = replay(log, "--controller", "lqg-ltr")
 
-    assert "loop right: no expected RMS: learn: the longest piece in VERNIER is" in text
+    assert "loop right: no expected RMS: learn: the longest piece in VERNIER at 50 Hz is" in text
 
 
 @pytest.mark.long

@@ -259,7 +259,7 @@ def test_learning_with_a_replaced_value_has_the_rest_of_the_logs_rig(design, tmp
     )
 
     assert status == 2
-    assert "learn: the longest piece in VERNIER is 0 s" in err
+    assert "learn: the longest piece in VERNIER at 50 Hz is 0 s" in err
 
 
 @pytest.mark.parametrize(

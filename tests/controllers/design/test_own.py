@@ -103,6 +103,19 @@ def test_saved_as_matrices_it_needs_no_python(file, tmp_path):
             "c must be a matrix of shape",
         ),
         (
+            EXAMPLE.replace("a=np.array([[1.0 - part]])", "a=1.0 - part"),
+            r"a must be a matrix of shape \(1, 1\), .*; its shape is \(\)",
+        ),
+        (
+            EXAMPLE.replace("c=np.array([[1.0], [part]])", "c=1.0"),
+            r"c must be a matrix of shape \(2, 1\), .*; its shape is \(\)",
+        ),
+        (
+            EXAMPLE.replace('{"gain": gain}', '{"gain": mirror}'),
+            "parameters must be numbers, .*: Object of type ndarray .*; of an array, use .tolist()",
+        ),
+        (EXAMPLE.replace('{"gain": gain}', "[gain]"), "parameters must be a dict, is list"),
+        (
             EXAMPLE.replace("0.8 *", "float('nan') *"),
             r"b must have finite numbers only; b\[0, \d\] is nan",
         ),
