@@ -29,7 +29,7 @@ from fitctl.controllers.design import coarse, lqg_ltr
 from fitctl.controllers.design.basis import Basis, Line, basis, night_of, with_plants_air
 from fitctl.controllers.design.choose import DESIGNS, design_for, solving
 from fitctl.controllers.design.deadzone import DeadzoneResult, deadzone_result
-from fitctl.controllers.design.draw import draw_loop_shapes, save_figure
+from fitctl.controllers.design.draw import draw_loop_shapes
 from fitctl.controllers.design.eq20 import eq20_zpk
 from fitctl.controllers.design.files import save_design
 from fitctl.controllers.design.linear_loop import loopshape
@@ -40,6 +40,7 @@ from fitctl.controllers.pair import LEARNT, Design
 from fitctl.error_budget import theory_to_plain
 from fitctl.model.optics import scales
 
+_PICTURES = (".png", ".svg")
 _RECOVERY_WEIGHTS = (1e-5, 1e-6, 1e-7, 1e-8, 0.5e-9, 1e-11)
 _COARSE_GAINS_HZ = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0)
 _OTHER_NOISE = 0.1  # so much may a saved design's noise differ from the sensor's, in parts of that
@@ -87,16 +88,8 @@ def design(
     vernier designs the paper's LQG/LTR; compare shows all designs side by side. learn estimates air path, noise
     and vibrations of a night from a log, and makes a design for that night.
     """
-    if out is not None and out.suffix != ".json":
-        msg = f"design {what}: --out {out}: must end in .json, or no rig file can name it"
-        raise ConfigError(msg)
-    if out is not None and os.path.exists(out) and not overwrite:  # if it can be examined
-        msg = f"design {what}: --out {out}: exists already; give another name, or pass --overwrite"
-        raise ConfigError(msg)
+    _check_files(what, plot, out, overwrite=overwrite)
     name = "lqg-ltr" if what == "vernier" else what
-    if plot is not None and name != "lqg-ltr":
-        msg = f"design {what}: --plot draws Fig. 9: use it with vernier"
-        raise ConfigError(msg)
     if what == "learn":
         chosen = chosen_logs("design learn", logs, rig, latest=latest)
         learn(chosen, rig, overrides, loop, out, as_json=as_json)
@@ -135,10 +128,31 @@ def design(
         its_basis = basis(settings, loop)
         vernier = _response(lqg_ltr.vernier_compensator(its_basis))
         title = "Coarse and vernier loop shapes (Fig. 9), LQG/LTR"
-        save_figure(draw_loop_shapes(its_basis, vernier, title), plot)
+        figure = draw_loop_shapes(its_basis, vernier, title)
+        try:
+            figure.savefig(plot, dpi=150)
+        except OSError as error:
+            msg = f"design {what}: --plot {plot}: cannot be written: {error.strerror}; name another file"
+            raise ConfigError(msg) from None
     say_lines(to_json(result) if as_json else "\n".join(lines))
     if out is not None and not as_json:
         say(f"written: {out} (name it in loops.{loop}.vernier.controller)")
+
+
+def _check_files(what: str, plot: Path | None, out: Path | None, *, overwrite: bool) -> None:
+    """Refuse files that cannot be written, before anything is computed or written."""
+    if out is not None and out.suffix != ".json":
+        msg = f"design {what}: --out {out}: must end in .json, or no rig file can name it"
+        raise ConfigError(msg)
+    if out is not None and os.path.exists(out) and not overwrite:  # if it can be examined
+        msg = f"design {what}: --out {out}: exists already; give another name, or pass --overwrite"
+        raise ConfigError(msg)
+    if plot is not None and what not in {"vernier", "lqg-ltr"}:
+        msg = f"design {what}: --plot draws Fig. 9: use it with vernier"
+        raise ConfigError(msg)
+    if plot is not None and plot.suffix.lower() not in _PICTURES:
+        msg = f"design {what}: --plot {plot}: expected a name that ends in {' or '.join(_PICTURES)}"
+        raise ConfigError(msg)
 
 
 # ---------------------------------------------------------------- the paper's vernier and coarse
@@ -338,7 +352,7 @@ def _saved(file: str) -> Callable[[Rig, str], Report]:
         if design.parameters.get("lines") and not design.learnt:
             lines.append(
                 "  of the rig file's night; fitctl design '{...}', with its name and parameters as JSON, shows "
-                "what it leaves of the night that it was made for"
+                "what it leaves of the night that it expects, with lines as far as it counteracts them"
             )
         return result, lines
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fitctl.config import ConfigError
 from fitctl.controllers.design.basis import Basis
 from fitctl.controllers.design.linear_loop.loopshape import Response, coarse_response, delayed
 
@@ -46,21 +44,3 @@ def draw_loop_shapes(basis: Basis, vernier: Response, title: str) -> Figure:
         axes.grid(visible=True, which="both", alpha=0.3)
         axes.legend(loc="lower left")
     return figure
-
-
-def save_figure(figure: Figure, path: Path) -> None:
-    """Write a figure, PNG or SVG by the file's name.
-
-    Raises
-    ------
-    ConfigError
-        If the name asks for something else, or the file cannot be written.
-    """
-    if path.suffix.lower() not in {".png", ".svg"}:
-        msg = f"{path}: plots are .png or .svg; choose another name"
-        raise ConfigError(msg)
-    try:
-        figure.savefig(path, dpi=150)
-    except OSError as error:
-        msg = f"{path}: cannot be written: {error.strerror}"
-        raise ConfigError(msg) from None

@@ -220,7 +220,10 @@ BAD_INPUT = {
     "a file that is none": (["none.json"], "none.json: no such design file"),
     "a file of what was saved": (["none.json", "--out", "x.json"], "--out is for a design"),
     "a loop that is none": (["bound", "--loop", "left"], "has right"),
-    "a plot of another kind": (["vernier", "--plot", "fig9.bmp"], ".png or .svg"),
+    "a plot of another kind": (
+        ["vernier", "--plot", "fig9.bmp", "--out", "nowhere/x.json"],  # found before anything is written
+        "--plot fig9.bmp: expected a name that ends in .png or .svg",
+    ),
     "a plot of what has none": (["bound", "--plot", "bound.png"], "use it with vernier"),
     "a file of what is no pair": (["compare", "--out", "all.json"], "--out is for a design"),
     "a file that cannot be": (["eq20", "--out", "/dev/null/x.json"], "/dev/null/x.json"),
