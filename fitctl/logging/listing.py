@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,7 +20,8 @@ def logs_in(folder: Path) -> tuple[list[LogInfo], dict[Path, LogError]]:
         try:
             logs.append(log_info(path))
         except LogError as error:
-            problems[path] = error
+            if os.path.lexists(path):  # else deleted a moment ago
+                problems[path] = error
     return sorted(logs, key=lambda log: log.start_s if log.counts else 0.0), problems
 
 

@@ -83,8 +83,8 @@ def find_run(paths: Sequence[Path], rig: Rig | None = None, overrides: Sequence[
     for log in logs[1:]:
         if _identity(log) != _identity(logs[0]):
             msg = (
-                f"{log.path}: is of another run than {logs[0].path}; report each alone, or put them "
-                "side by side with --compare"
+                f"{log.path}: is of another run than {logs[0].path}; give the files of one run (fitctl report "
+                "--compare puts nights side by side)"
             )
             raise LogError(msg)
     with_records = sorted((log for log in logs if log.counts), key=lambda log: log.start_s)

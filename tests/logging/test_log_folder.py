@@ -15,6 +15,7 @@ from fitctl.config import Logging
 from fitctl.logging.copying import merge
 from fitctl.logging.errors import LogError
 from fitctl.logging.folder import in_use, is_kept, keep, new_log_path, prune
+from fitctl.logging.listing import logs_in
 from fitctl.logging.reading import log_info, tick_arrays
 from fitctl.logging.rotation import RotatingLog
 from fitctl.logging.verifying import verify
@@ -300,6 +301,23 @@ def test_a_limit_that_would_leave_no_finished_file_is_refused():
     document = SETTINGS.model_dump() | {"rotate_bytes": 1_000_000, "retain_bytes": 1_999_999}
     with pytest.raises(ValidationError, match="retain_bytes: must be at least"):
         Logging(**document)
+
+
+def test_a_log_that_is_deleted_while_the_folder_is_listed_is_not_called_unreadable(
+    tmp_path, monkeypatch
+):
+    recorded(SETTINGS, tmp_path, 1)
+    (gone := tmp_path / "old.mcap").write_bytes(b"")
+
+    def late_info(path):
+        gone.unlink(missing_ok=True)
+        return log_info(path)
+
+    monkeypatch.setattr("fitctl.logging.listing.log_info", late_info)
+    logs, problems = logs_in(tmp_path)
+
+    assert len(logs) == 1
+    assert problems == {}
 
 
 def test_names_tell_rig_and_start_and_never_clash(tmp_path):
