@@ -12,7 +12,12 @@ SHARED = {
     "--controller": ("NAME", False, False, r"eq20, lqg-ltr, minimum-variance, fslq, or a file"),
     "--duration": ("SECONDS", False, False, r""),
     "--from": ("TIME", False, False, r"Seconds after LOG's start, or UTC\."),
-    "--json": (None, False, True, r"Print (the result as one|one) JSON object"),
+    "--json": (
+        None,
+        False,
+        True,
+        r"Print ((the result as one|one) JSON object|one JSON array of the \w+)",
+    ),
     "--latest": (None, False, True, r"Use the newest log of the rig, in place of LOG\."),
     "--log": ("FILE|LOG", False, False, r"log"),
     "--loop": (None, False, False, r"Name of one loop\."),

@@ -22,7 +22,13 @@ from fitctl.commands.shared.logs import (
     logs_alone,
     say_left_out,
 )
-from fitctl.commands.shared.options import JsonOption, OverwriteOption, RigOption, SetOption
+from fitctl.commands.shared.options import (
+    JsonArrayOption,
+    JsonOption,
+    OverwriteOption,
+    RigOption,
+    SetOption,
+)
 from fitctl.commands.shared.printing import say, to_json
 from fitctl.config import ConfigError
 from fitctl.logging import copying, exporting, folder, verifying
@@ -60,7 +66,9 @@ class Format(StrEnum):
 
 
 @app.command("list")
-def list_(rig: RigOption = None, overrides: SetOption = None, as_json: JsonOption = False) -> None:
+def list_(
+    rig: RigOption = None, overrides: SetOption = None, as_json: JsonArrayOption = False
+) -> None:
     """List the logs of a rig, the newest last.
 
     Reads the folder `logging.folder` of the rig file. Exit status 1 if a log in it cannot be read.
@@ -244,7 +252,7 @@ def verify(
     logs: LogsArgument = None,
     latest: LatestOption = False,
     rig: RigOption = None,
-    as_json: JsonOption = False,
+    as_json: JsonArrayOption = False,
 ) -> None:
     """Check that logs are whole.
 
@@ -290,7 +298,7 @@ def recover(
 ) -> None:
     """Make a whole log from a damaged one.
 
-    LOG itself does not change.
+    LOG itself does not change. Exit status 1 if the new log has problems too: what a record says is not mended.
     """
     log = log_alone("log recover", log, rig, latest=latest)
     if folder.in_use(log):
@@ -305,9 +313,10 @@ def recover(
     target = out or log.with_name(f"{log.stem}_recovered.mcap")
     _insist_on_another(target, [log])
     saved = copying.recover(log, target, overwrite=overwrite)
+    left = verifying.verify(target).problems
     if as_json:
-        say(to_json({"log": str(log), "out": str(target), **asdict(saved)}))
-        return
+        say(to_json({"log": str(log), "out": str(target), **asdict(saved), "problems": left}))
+        raise typer.Exit(FAILED if left else 0)
     lost = f"{saved.damaged_chunks} damaged chunks skipped, " if saved.damaged_chunks else ""
     if saved.undescribed:
         lost += f"{saved.undescribed} records lost that only a damaged chunk describes, "
@@ -316,6 +325,9 @@ def recover(
     say(
         f"{target}: {saved.records} records saved; {lost}{saved.unread_bytes} bytes at the end unreadable"
     )
+    for problem in left:
+        say(f"  cannot be mended: {problem}")
+    raise typer.Exit(FAILED if left else 0)
 
 
 @app.command()

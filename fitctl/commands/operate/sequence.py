@@ -105,7 +105,9 @@ def list_(
     ] = None,
     as_json: Annotated[
         bool,
-        typer.Option("--json", help="Print one JSON object a sequence, with every step and key."),
+        typer.Option(
+            "--json", help="Print one JSON array of the sequences, with every step and key."
+        ),
     ] = False,
 ) -> None:
     """List the shipped sequences."""

@@ -43,6 +43,7 @@ SeedOption = Annotated[
     int, typer.Option(min=0, help="Seed of the plant's noise and the star's position.")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")]
+JsonArrayOption = Annotated[bool, typer.Option("--json", help="Print one JSON array of the logs.")]
 LoopOption = Annotated[
     str, typer.Option("--loop", help="Name of one loop.", autocompletion=completion.loops)
 ]

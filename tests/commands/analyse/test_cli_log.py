@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 from mcap.exceptions import EndOfFile
-from samples.forged_logs import with_topic_of_another_program
+from samples.forged_logs import forged, with_topic_of_another_program
 from samples.log_samples import (
     RUN_INFO,
     SETTINGS,
@@ -125,6 +125,21 @@ def test_recover_says_how_many_records_were_saved_and_overwrites_nothing(log, wh
     assert (status, text) == (2, "")
     assert error == (f"{target}: exists already; give another name with --out, or pass --overwrite")
     assert log("recover", broken, "--overwrite")[0] == 0
+
+
+def test_recover_names_what_it_cannot_mend(log, whole, tmp_path):
+    """A record's own time is what it says: nobody knows which it should have been."""
+    tick = "/fit/right/tick"
+    wrong = forged(whole, tmp_path / "wrong.mcap", lambda one: 0 if one.topic == tick else None)
+
+    status, text, _ = log("recover", wrong)
+    assert status == 1
+    assert "cannot be mended: record" in text
+    assert "its own time is more than a day outside the log's" in text
+
+    status, text, _ = log("recover", wrong, "--overwrite", "--json")
+    assert status == 1
+    assert len(json.loads(text)["problems"]) == 1
 
 
 def test_recover_leaves_a_whole_log_alone(log, whole):
