@@ -59,8 +59,8 @@ def design_for(
             design = DESIGNS[chosen](replace(its_basis, noise_px=noise_px or its_basis.noise_px))
     else:
         msg = (
-            f"controller {chosen}: there are {', '.join(DESIGNS)}, files (*.json) that `fitctl design` "
-            "saved, and Python files (*.py) of your own"
+            f"controller {chosen}: unknown; expected {', '.join(DESIGNS)}, a file (*.json) that "
+            "`fitctl design` saved, or a Python file (*.py) of your own"
         )
         raise ConfigError(msg)
     if not sampled_loop(design, on_its_mirror(its_basis, design.parameters)).stable:
