@@ -328,7 +328,7 @@ class StellarLoop(Loop):
         if self.mode is Mode.ACQUISITION:
             others = {
                 other.name: OtherStages(
-                    other._stages_px_at(frame.mid_exposure_s), rest=other.mode not in TRACKING
+                    other._stages_px_at(frame.mid_exposure_s), follow=other.mode in FOLLOWING
                 )
                 for other in self.others
             }

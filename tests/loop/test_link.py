@@ -8,6 +8,7 @@ from fitctl.logging.records import Event, ModeChange, Overlap, Tick
 from fitctl.messages.commands import (
     Acquire,
     Experiment,
+    Jog,
     Off,
     Recover,
     Release,
@@ -99,6 +100,10 @@ class Testbed:
         light_dn = scene._flux_dn
         scene._flux_dn = light_dn * np.array([one != name for pair in spots for one in pair])
         return lambda: setattr(scene, "_flux_dn", light_dn)
+
+    def star_px(self, name):
+        now_s = self.clock.now_s()
+        return self.simulation.plants[name].history_px(now_s - 0.02, now_s)[-1, 0, 0]
 
     def rms_px(self, name, since_s):
         return true_residual_rms(
@@ -298,6 +303,35 @@ def test_neither_loop_takes_the_others_star_while_one_is_away(held):
         since_s = held.clock.now_s()
         held.run(3.0)
         assert held.rms_px(away, since_s).max() < 0.1
+
+
+@pytest.mark.long
+def test_a_star_that_the_link_carries_to_where_the_candidate_is_expected_is_not_its_own(held):
+    """Only the star of left is on the frame, and left waits for its link, whose siderostat is jogged."""
+    held.command(Release())
+    held.darken(RIGHT)
+    left, right = held.loop(LEFT), held.loop(RIGHT)
+    for command in (Acquire(loop=LEFT), Acquire(loop=RIGHT)):
+        assert held.command(command).accepted
+    while right.star_finder.attribution.candidate is None:
+        held.run(0.02)
+        assert right.mode is Mode.ACQUISITION
+    since_s = held.clock.now_s()
+    link = left.star_motion.link
+    moves_px = right.target_px - held.star_px(LEFT)
+    link_rad = np.linalg.solve(link.matrix, left._scale.motor_rad(moves_px))
+    per_rad = link.loop.settings.siderostat.sky_arcsec_per_motor_rad
+    az, el = (per_rad * link_rad).tolist()
+    assert held.command(Jog(loop=METROLOGY, az_sky_arcsec=az, el_sky_arcsec=el)).accepted
+    held.run(1.5)
+    assert held.star_px(LEFT) == pytest.approx(right.target_px, abs=2.0)
+    assert "link of metrology" in left.waits_for
+    held.run(5.0)
+    assert not [
+        change
+        for change in held.records
+        if isinstance(change, ModeChange) and change.loop == RIGHT and change.time_s > since_s
+    ]
 
 
 @pytest.mark.long

@@ -30,8 +30,8 @@ Floats = NDArray[np.float64]
 class OtherStages(NamedTuple):
     """Of another loop whose star may be on the frame, at the exposure."""
 
-    moved_px: AzEl  # how far they move its star
-    rest: bool  # they follow no star and search for none; only a jog moves them
+    moved_px: AzEl  # how far they, and a link's siderostat, move its star
+    follow: bool  # they follow it: it is no candidate of this loop
 
 
 class Attribution:
@@ -116,16 +116,16 @@ class Attribution:
     def has_moved(self, star: Star, others: Mapping[str, OtherStages]) -> bool:
         """What the second look shows, where the candidate is expected now, was moved by the own stages alone.
 
-        It has left the candidate's place, and is not where another loop's stages, which rest, would have taken
-        it: a jog may take that loop's star to where the own one is expected.
+        It has left the candidate's place, and is not where it would be if it were the star of another loop that
+        does not follow it: a jog or a link may take that one to where the own one is expected.
         """
         if self.candidate is None:
             return False
         az_px, el_px, *_ = self.candidate
         places_px = [(az_px, el_px)]
-        for name, (now_px, rest) in others.items():
+        for name, (now_px, follow) in others.items():
             then_px = self._others[name].moved_px
-            if rest:
+            if not follow:
                 places_px.append((az_px + now_px[0] - then_px[0], el_px + now_px[1] - then_px[1]))
         return not any(is_within(*star[:2], *place_px, HALF_WINDOW_PX) for place_px in places_px)
 
