@@ -16,10 +16,14 @@ import tomlkit
 from fitctl.commissioning.outcome import DONE, Outcome, State
 from fitctl.config import ConfigError
 from fitctl.config.reading import lay_over
-from fitctl.files import read_regular, replaced_whole
+from fitctl.files import open_regular, read_regular, replaced_whole
 from fitctl.text import UNDECODABLE
 
 _MOST_BYTES = 16 << 20
+_FOUND_MARK = b"# Found by `fitctl commission`"
+_RIG_MARK = b"# Written by `fitctl commission`"
+_PAGE_MARK = b"<title>Commissioning of "
+_MARKED = 500  # within so many bytes of its beginning, each file has its mark
 
 
 class Entry(msgspec.Struct, frozen=True):
@@ -126,14 +130,43 @@ class Files:
         self.rig = folder / f"{stem}.commissioned.toml"
         self.page = folder / f"{stem}.commissioning.html"
 
+    def require_own(self) -> None:
+        """Refuse to replace files that no commissioning wrote; with a record, all are its own.
+
+        Raises
+        ------
+        ConfigError
+            If there is one, or one cannot be read.
+        """
+        if os.path.exists(self.record):
+            return
+        marks = {self.found: _FOUND_MARK, self.rig: _RIG_MARK, self.page: _PAGE_MARK}
+        for path, mark in marks.items():
+            try:
+                with open_regular(path) as file:
+                    is_own = mark in file.read(_MARKED)
+            except FileNotFoundError:
+                continue
+            except OSError as error:
+                msg = (
+                    f"{path}: cannot be read: {error.strerror}; choose another place with --folder"
+                )
+                raise ConfigError(msg) from None
+            if not is_own:
+                msg = (
+                    f"{path}: exists, and `fitctl commission` has not written it; move it, or choose another "
+                    "place with --folder"
+                )
+                raise ConfigError(msg)
+
     def write_page(self, text: str) -> None:
         """Write the page to file."""
         _write(self.page, text.encode())
 
     def write_rig(self, found: dict[str, Any]) -> None:
         """Write what was found, and the rig file with its comments, that includes it."""
-        note = "# Found by `fitctl commission`, and laid over the rig file by its include list.\n\n"
-        _write(self.found, (note + tomli_w.dumps(found)).encode())
+        note = b", and laid over the rig file by its include list.\n\n"
+        _write(self.found, _FOUND_MARK + note + tomli_w.dumps(found).encode())
         document = tomlkit.parse(self._source.read_text(encoding="utf-8"))
         nearby = self._source.parent.resolve() == self.rig.parent.resolve()
 
@@ -153,7 +186,10 @@ class Files:
             text = tomlkit.dumps(document)
         else:  # a key of the document itself stands before its first table
             text = f"include = {tomlkit.item(include).as_string()}\n{text}"
-        _write(self.rig, text.encode())
+        note = (
+            f" from {self._source.name}: the next step writes it again. Edit that file instead.\n\n"
+        )
+        _write(self.rig, _RIG_MARK + f"{note}{text}".encode())
 
 
 def _include_list(path: Path, document: Mapping[str, Any]) -> list[str]:
@@ -172,7 +208,7 @@ def load(path: Path, rig_name: str) -> Commissioning:
     ConfigError
         If the file cannot be read, or is another rig's.
     """
-    if not path.exists():
+    if not os.path.exists(path):
         return Commissioning(rig_name)
     record = load_any(path)
     if record.rig != rig_name:

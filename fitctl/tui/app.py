@@ -37,6 +37,7 @@ from fitctl.tui.commands import BY_NAME, OPERATOR_COMMANDS, SCREENS, keys_of
 from fitctl.tui.dialogs import Alarms, Ask, Confirm, Reader, Running, events_text
 from fitctl.tui.graphics import Graphics, PictureSender
 from fitctl.tui.jobs import Job
+from fitctl.tui.look import as_markup
 from fitctl.tui.pace import Pace
 from fitctl.tui.palette import PlaceProvider
 from fitctl.tui.rewind.moment import Recording
@@ -447,18 +448,13 @@ class ConsoleApp(App[None]):
     def action_at_time(self) -> None:
         """Show the moment of a time that is typed."""
 
-        def refused(value: str) -> str:
-            return (
-                "" if self.playback.time_of(value) is not None else "a time is 03:14:07, or -2:30"
-            )
-
         def show(value: str | None) -> None:
             time_s = self.playback.time_of(value) if value else None
             if time_s is not None:
                 self.playback.to(time_s)
 
         prompt = "UTC, such as 03:14:07; or before the newest data, such as -2:30"
-        self.push_screen(Ask("Show the moment", prompt, "-1:00", refused), show)
+        self.push_screen(Ask("Show the moment", prompt, "-1:00", self.playback.refused), show)
 
     def _show_alarm(self, since_s: float | None) -> None:
         if since_s is not None:
@@ -520,7 +516,8 @@ class ConsoleApp(App[None]):
             yield SystemCommand(f"controller {name}", about, set_controller)
         for trip in self.state.loop.state.interlocks if self.state.loop else ():
             reset = partial(self.send, Reset(name=trip.name))
-            yield SystemCommand(f"reset {trip.name}", trip.reason, reset)
+            what, why = as_markup(f"reset {trip.name}"), as_markup(trip.reason)
+            yield SystemCommand(what, why, reset)
         for view in SCREENS:
             yield SystemCommand(
                 f"Screen: {view.label}", view.help, partial(self.action_view, view.name)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import ClassVar, TypeVar
 
-from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 from textual.app import ComposeResult
@@ -18,7 +17,7 @@ from fitctl.text import plain
 from fitctl.tui.alarms import AlarmBook, counts
 from fitctl.tui.inks import DIM, INK, ORANGE, RED, SKY
 from fitctl.tui.jobs import Job
-from fitctl.tui.look import Line, wall
+from fitctl.tui.look import Line, as_markup, wall
 from fitctl.tui.state import ConsoleState
 from fitctl.tui.widgets.events import event_lines
 
@@ -38,7 +37,7 @@ class Sheet(ModalScreen[ResultT]):
     def compose(self) -> ComposeResult:
         """One scrolling text in a frame."""
         with VerticalScroll() as sheet:
-            sheet.border_title = escape(self._title)
+            sheet.border_title = as_markup(self._title)
             sheet.border_subtitle = self.HINT
             yield Static(self._content, id="text")
 
@@ -71,7 +70,7 @@ class Alarms(Sheet[float | None]):
         super().__init__("Alarms", alarms_text(state, book, 0))
         self._state = state
         self._book = book
-        self._chosen = 0
+        self._chosen = ""  # the key of an alarm; the first, where there is none of this key
         self._shown = counts(book.in_order)
 
     def on_mount(self) -> None:
@@ -80,19 +79,24 @@ class Alarms(Sheet[float | None]):
 
     def _draw(self) -> None:
         self._shown = counts(self._book.in_order)
-        self._chosen = max(0, min(self._chosen, len(self._book.alarms) - 1))
-        text = alarms_text(self._state, self._book, self._chosen)
+        text = alarms_text(self._state, self._book, self._row())
         self.query_one("#text", Static).update(text)
 
     def action_choose(self, by: int) -> None:
         """Choose another alarm."""
-        self._chosen += by
+        alarms = self._book.in_order
+        if alarms:
+            self._chosen = alarms[max(0, min(self._row() + by, len(alarms) - 1))].key
         self._draw()
+
+    def _row(self) -> int:
+        keys = [alarm.key for alarm in self._book.in_order]
+        return keys.index(self._chosen) if self._chosen in keys else 0
 
     def action_show(self) -> None:
         """Show the console as it was before the chosen alarm."""
         alarms = self._book.in_order
-        self.dismiss(alarms[self._chosen].since_s if alarms else None)
+        self.dismiss(alarms[self._row()].since_s if alarms else None)
 
     def action_acknowledge(self) -> None:
         """Acknowledge all that the list shows."""
@@ -150,7 +154,7 @@ class Confirm(ModalScreen[bool]):
     def compose(self) -> ComposeResult:
         """The question, and what can be answered, for keyboard and mouse."""
         with Vertical(classes="sheet") as sheet:
-            sheet.border_title = escape(self._title)
+            sheet.border_title = as_markup(self._title)
             sheet.border_subtitle = "s stops"
             yield Static(self._question, markup=False)
             yield Static(
@@ -188,7 +192,7 @@ class Ask(ModalScreen[str | None]):
     def compose(self) -> ComposeResult:
         """The field, and what is wrong with it."""
         with Vertical(classes="sheet") as sheet:
-            sheet.border_title = escape(self._title)
+            sheet.border_title = as_markup(self._title)
             sheet.border_subtitle = "enter accepts · esc cancels · ^s stops"
             yield Static(Text(self._prompt, DIM))
             yield Input(self._value, id="value")

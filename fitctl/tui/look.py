@@ -79,6 +79,14 @@ def text(content: str, colour: str = INK, *, on: str | None = None, bold: bool =
     return Segment(plain(content), style(colour, on, bold=bold))
 
 
+def as_markup(content: str) -> str:
+    """A text where Textual takes markup: titles, and what its palette lists.
+
+    Textual's own `escape` and Rich's leave brackets that Textual then reads, such as ``[/`` and ``[$x]``.
+    """
+    return plain(content).replace("[", r"\[")
+
+
 @lru_cache(maxsize=256)
 def _doing(action: str) -> Style:
     return Style.from_meta({"@click": action})

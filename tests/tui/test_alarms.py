@@ -318,6 +318,33 @@ def test_an_alarm_that_came_after_the_list_was_drawn_is_not_acknowledged_by_it()
     assert acknowledged == {"interlock known: low": True, "interlock new: low": False}
 
 
+def test_an_alarm_stays_chosen_whatever_comes_and_goes(monkeypatch):
+    watch = Watch(FakeSupervisor())
+    watch.supervisor.interlocks = [tripped("one"), tripped("two")]
+    watch.hear()
+    dialog, shown_s = Alarms(watch.state, watch.book), []
+    monkeypatch.setattr(dialog, "_draw", lambda: None)
+    monkeypatch.setattr(dialog, "dismiss", shown_s.append)
+    dialog.action_choose(1)
+    chosen = watch.book.in_order[1]
+    watch.supervisor.interlocks = [tripped("one"), tripped("two"), tripped("three")]
+    watch.hear()
+    dialog.action_show()
+    watch.book.alarms.clear()
+    watch.supervisor.interlocks = [tripped("one")]
+    (left,) = watch.hear()
+    dialog.action_show()
+
+    assert shown_s == [chosen.since_s, left.since_s]
+
+
+def test_an_alarm_of_a_million_letters_is_cut_to_what_the_bar_shows():
+    watch = Watch(FakeSupervisor())
+    watch.supervisor.interlocks = [msgspec.structs.replace(tripped("x"), reason="a b" * 300_000)]
+    watch.hear()
+    assert len(watch.bar()[0]._alarm_lines(80, 24)) < 100
+
+
 def test_a_stop_says_who_it_was_and_looks_like_no_fault():
     watch = Watch(stopped_testbed())
     assert watch.hear() == []

@@ -12,6 +12,7 @@ import typer
 
 from fitctl.commands.operate.logged_loops import loops_at_start
 from fitctl.commands.operate.web import serve_console
+from fitctl.commands.shared.exits import FAILED
 from fitctl.commands.shared.logs import LatestOption, chosen_log
 from fitctl.commands.shared.options import RemoteOption, RigOption, SetOption
 from fitctl.commands.shared.rig import rig_of
@@ -151,3 +152,5 @@ def _run(app: ConsoleApp, niceness: int = _NICENESS) -> None:
     # asks the supervisor for what that then does in its own time.
     give_way(niceness)
     app.run()
+    if app.return_code:  # Textual has printed why it ended
+        raise typer.Exit(FAILED)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -25,7 +27,7 @@ from fitctl.config import ConfigError, Rig, default_rig_path, load_rig
 from fitctl.config.reading import read_parts
 from fitctl.config.simulated import places
 from fitctl.mocks.bench import ClearFaults, FaultsNow, SetFault, ask_bench
-from fitctl.processes import ENDING_SIGNALS, end_with_parent, ended_by_signals
+from fitctl.processes import ENDING_SIGNALS, end_with_parent, ended_by_signals, name_held
 
 _MARKS: dict[State, str] = {
     "passed": "passed",
@@ -92,6 +94,9 @@ def commission(
     settings = load_rig(path, overrides or ())
     where = _folder(path, folder, reads_only=list_steps)
     if on_console:
+        if only or until or skipped or compare or list_steps or as_json:
+            msg = "commission: --console has each step to choose; leave out --only, --until, --skip and such"
+            raise ConfigError(msg)
         from fitctl.commands.operate.console import commissioning_console
 
         short = ["--quick"] if quick else []
@@ -102,35 +107,68 @@ def commission(
         _require_permission(real, yes=yes, by_console=console_pid is not None)
     end_with_parent(console_pid)
     files = Files(path, where)
-    course = Course(
-        path,
-        tuple(overrides or ()),
-        files,
-        load(files.record, settings.name),
-        _reporter(silent=as_json and yes),  # an operator who answers questions must see what moves
-        quick,
-        _by_hand if real or not (yes or console_pid) else partial(_by_bench, settings),
-    )
-    earlier = None if compare is None else load_any(compare)
-    tasks = tasks_of(settings)
-    wanted = chosen(tasks, _known(tasks, only or []))
-    if until:
-        last = chosen(tasks, _known(tasks, [until]))[-1]
-        wanted = [task for task in wanted if tasks.index(task) <= tasks.index(last)]
-    if list_steps:
-        _list(course, tasks, as_json=as_json)
-        return
-    left_out = [task for text in skipped or [] for task in _skip(course, tasks, text)]
-    wanted = [task for task in wanted if task not in left_out]
-    try:
-        with ended_by_signals(_interrupt_once):
-            _do_all(course, wanted, again=bool(only), yes=yes)
-    except KeyboardInterrupt:
-        say("commission: interrupted; nothing is recorded of the step that was running", err=True)
-        raise typer.Exit(INTERRUPTED) from None
-    _conclude(course, tasks, earlier, as_json=as_json)
-    if not all(course.record.done(task.name) for task in wanted):
-        raise typer.Exit(FAILED)
+    with ExitStack() as locked:
+        if not list_steps:
+            locked.enter_context(_only_commissioning(files.record))
+            files.require_own()
+        course = Course(
+            path,
+            tuple(overrides or ()),
+            files,
+            load(files.record, settings.name),
+            # An operator who answers questions must see what moves.
+            _reporter(silent=as_json and yes),
+            quick,
+            _by_hand if real or not (yes or console_pid) else partial(_by_bench, settings),
+        )
+        earlier = None if compare is None else load_any(compare)
+        tasks = tasks_of(settings)
+        wanted = _wanted(tasks, only or [], until)
+        if list_steps:
+            _list(course, tasks, as_json=as_json)
+            return
+        left_out = [task for text in skipped or [] for task in _skip(course, tasks, text)]
+        wanted = [task for task in wanted if task not in left_out]
+        try:
+            with ended_by_signals(_interrupt_once):
+                _do_all(course, wanted, again=bool(only), yes=yes)
+        except KeyboardInterrupt:
+            say(
+                "commission: interrupted; nothing is recorded of the step that was running",
+                err=True,
+            )
+            raise typer.Exit(INTERRUPTED) from None
+        _conclude(course, tasks, earlier, as_json=as_json)
+        if not all(course.record.done(task.name) for task in wanted):
+            raise typer.Exit(FAILED)
+
+
+@contextmanager
+def _only_commissioning(record: Path) -> Iterator[None]:
+    """Keep a second commissioning from the same record: each would overwrite what the other wrote."""
+    with ExitStack() as held:
+        try:
+            held.enter_context(name_held(f"fitctl-commissioning:{record.resolve()}"))
+        except BlockingIOError as error:
+            msg = (
+                f"commission: {record}: another commissioning ({error.strerror}) works on this record; end it "
+                "first, or choose another place with --folder"
+            )
+            raise ConfigError(msg) from None
+        yield
+
+
+def _wanted(tasks: list[Task], only: list[str], until: str) -> list[Task]:
+    """The tasks that --only and --until leave."""
+    wanted = chosen(tasks, _known(tasks, only))
+    if not until:
+        return wanted
+    last = tasks.index(chosen(tasks, _known(tasks, [until]))[-1])
+    wanted = [task for task in wanted if tasks.index(task) <= last]
+    if not wanted:
+        msg = f"commission: --only {only[0]} comes after --until {until}; leave one of them out"
+        raise ConfigError(msg)
+    return wanted
 
 
 def _interrupt_once() -> None:
@@ -183,12 +221,20 @@ def _require_permission(real: list[str], *, yes: bool, by_console: bool) -> None
 
 def _folder(path: Path, folder: Path | None, *, reads_only: bool) -> Path:
     wanted = folder or (Path.cwd() if path == default_rig_path() else path.parent)
-    if not wanted.is_dir():
+    if not os.path.isdir(wanted):  # also where it cannot be examined
         msg = f"commission: {wanted}: no such folder; make it, or choose another with --folder"
         raise ConfigError(msg)
     if not (reads_only or writable(wanted)):
         msg = f"commission: {wanted}: nothing can be written there; choose another with --folder"
         raise ConfigError(msg)
+    for name in (path.resolve(), wanted.resolve()):
+        try:
+            str(name).encode()
+        except UnicodeEncodeError:
+            msg = (
+                f"commission: {name}: its name is not UTF-8, as names in a rig file are; rename it"
+            )
+            raise ConfigError(msg) from None
     return wanted
 
 

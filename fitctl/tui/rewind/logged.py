@@ -316,4 +316,6 @@ def _all_bounded(value: Any) -> bool:
         return all(map(_all_bounded, value.values()))
     if isinstance(value, list | tuple):
         return all(map(_all_bounded, value))
+    if isinstance(value, str):
+        return len(value) <= MOST_TEXT
     return not isinstance(value, float | int) or _is_bounded(value)

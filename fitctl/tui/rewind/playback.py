@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from fitctl.logging.records import Event
 from fitctl.messages.commands import AnyCommand, Stop
 from fitctl.tui.alarms import AlarmBook
+from fitctl.tui.look import wall
 from fitctl.tui.rewind.moment import Recording
 from fitctl.tui.rewind.player import Player
 from fitctl.tui.state import ConsoleState
@@ -154,6 +155,8 @@ class Playback:
             return None
         if not 1 <= len(parts) <= 3 or not all(math.isfinite(p) and p >= 0 for p in parts):
             return None
+        if any(part >= 60.0 for part in parts[1:]):
+            return None
         seconds = sum(part * 60.0**power for power, part in enumerate(reversed(parts)))
         newest_s = self.recording.span_s()[1]
         if text.strip()[:1] in {"-", "−"}:
@@ -168,6 +171,16 @@ class Playback:
         if wall_s > newest_wall_s:
             wall_s -= 86400.0  # of the evening before
         return newest_s + wall_s - newest_wall_s
+
+    def refused(self, text: str) -> str:
+        """Why no moment is shown for a text, or nothing."""
+        time_s, oldest_s = self.time_of(text), self.recording.span_s()[0]
+        if time_s is None:
+            return "a time is 03:14:07, or -2:30"
+        if time_s < oldest_s - SAME_S:
+            older = "" if self.log_name else "; older data are in the log"
+            return f"the oldest data here are of {wall(self.state.wall_s(oldest_s))}{older}"
+        return ""
 
     def close(self) -> None:
         """End the thread."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import tempfile
 import tomllib
@@ -126,7 +127,7 @@ class SequencesView(View):
             if value is not None:
                 step[parameter.key] = parsed(value)
                 sequences.edited.add(document["file"])
-                self._start("check")
+                self._start(document, "check")
 
         prompt = (
             f"step {parameter.step + 1}, {step['step']}: {parameter.key} (is {parameter.value!r})"
@@ -135,9 +136,11 @@ class SequencesView(View):
 
     def action_dry_run(self) -> None:
         """Rehearse the chosen sequence on the virtual clock, from where the stages are now."""
-        if self._chosen():
+        document = self._chosen()
+        if document is not None:
             from_now = [] if self.state.stale or not self.state.live else ["--present"]
-            self._start("dry-run", *from_now, *(self.console.remote_arguments if from_now else ()))
+            remote = self.console.remote_arguments if from_now else ()
+            self._start(document, "dry-run", *from_now, *remote)
 
     def action_go(self) -> None:
         """Run the chosen sequence on the instrument, after the operator has confirmed it."""
@@ -150,7 +153,11 @@ class SequencesView(View):
         steps = ", ".join(step["step"] for step in document["steps"])
         question = f"Run {document['name']} on the instrument? It moves the stages: {steps}."
         remote = self.console.remote_arguments
-        self.console.ask("Run", question, lambda: self._start("run", *remote, outlives=True))
+
+        def run() -> None:
+            self._start(document, "run", *remote, outlives=True)
+
+        self.console.ask("Run", question, run)
 
     def action_pause(self) -> None:
         """Pause what is under way, or let it go on."""
@@ -170,7 +177,7 @@ class SequencesView(View):
                 self._list = self.console.start_job(["sequence", "list", "--json", name])
 
         def refused(name: str) -> str:
-            return "" if Path(name).is_file() else f"{name}: no such file"
+            return "" if os.path.isfile(name) else f"{name}: no such file"
 
         self.app.push_screen(Ask("Open", "a sequence file (TOML or YAML)", "", refused), accept)
 
@@ -201,11 +208,12 @@ class SequencesView(View):
             self._editions[content] = str(path)
         return self._editions[content]
 
-    def _start(self, word: str, *more: str, outlives: bool = False) -> None:
-        """Do something with the chosen sequence; never with the file of another rig."""
+    def _start(
+        self, document: dict[str, Any], word: str, *more: str, outlives: bool = False
+    ) -> None:
+        """Do something with a sequence; never with the file of another rig."""
         rig_arguments = self.console.rig_arguments
-        document = self.query_one(SequenceList).document
-        if rig_arguments is not None and document is not None:
+        if rig_arguments is not None:
             arguments = ["sequence", word, self._file(document), *rig_arguments, *more]
             printed = self.query_one(Printed)
             printed.start(self.console.start_job, *arguments, outlives=outlives)

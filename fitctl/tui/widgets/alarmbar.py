@@ -117,6 +117,7 @@ def _written(head: Segment, words: Words, columns: int, inks: Inks) -> list[Line
     """
     indent = head.cell_length + 1
     room = max(10, columns - indent)
+    words = Words(*(one[: MOST_ROWS * room] for one in words))  # no more is shown
     did, todo = f"→ {words.did}" if words.did else "", f"▸ {words.todo}" if words.todo else ""
     first, then = [(words.what, inks.what)], [(todo, inks.todo)]
     if len(f"{words.what} {did}") <= room or len(f"{did}  {todo}") > room:

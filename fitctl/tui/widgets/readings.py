@@ -18,6 +18,7 @@ from fitctl.tui.inks import DIM, GREEN, INK, ORANGE, RED, SKY
 from fitctl.tui.look import (
     DEVICES,
     Line,
+    as_markup,
     bar,
     duration,
     in_columns,
@@ -166,11 +167,11 @@ class Detail(Panel):
         """Words at the left, the course at the right."""
         loop, row, device = self.state.loop, self._readings.now(), self._devices.now()
         if self._readings.has_focus and loop is not None and row is not None:
-            self.border_title = row.name
+            self.border_title = as_markup(row.name)
             words = reading_lines(loop, row)
             course = self._course(loop, row, columns // 2, rows)
         elif device is not None:
-            self.border_title = device.device
+            self.border_title = as_markup(device.device)
             words = device_lines(self._devices, device)
             course = self._events_of(device, columns // 2, rows)
         else:

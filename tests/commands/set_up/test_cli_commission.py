@@ -1,6 +1,7 @@
 """`fitctl commission` on the command line: when it asks, what it refuses, what it lists."""
 
 import json
+import os
 
 import pytest
 
@@ -9,6 +10,7 @@ from fitctl.commissioning import tasks
 from fitctl.commissioning.outcome import Outcome
 from fitctl.commissioning.tasks import STEPS, Step
 from fitctl.config import default_rig_path
+from fitctl.processes import name_held
 
 REAL = "loops.right.siderostat.device.channel=/dev/ttyACM0"
 
@@ -91,6 +93,12 @@ def test_a_console_needs_a_terminal(commission):
             ("--folder", "/nowhere"),
             "/nowhere: no such folder; make it, or choose another with --folder",
         ),
+        (("--folder", 300 * "x"), "no such folder"),
+        (
+            ("--only", "camera", "--until", "devices"),
+            "--only camera comes after --until devices; leave one of them out",
+        ),
+        (("--console", "--only", "camera"), "leave out --only"),
     ],
 )
 def test_a_wrong_option_is_named(commission, arguments, named):
@@ -130,6 +138,51 @@ def test_a_reason_stays_in_the_record(commission, two_steps):
 def test_what_is_skipped_is_not_done_even_by_its_name(commission, two_steps):
     status, _ = commission("--yes", "--skip", "one=no lamp tonight", "--only", "one")
     assert (status, two_steps) == (0, [])
+
+
+def test_a_second_commissioning_of_the_same_record_is_refused(commission, two_steps, tmp_path):
+    record = tmp_path.resolve() / "fit-mock.commissioning.json"
+    with name_held(f"fitctl-commissioning:{record}"):
+        status, text = commission("--yes", "--until", "one")
+        assert commission("--list")[0] == 0
+
+    assert (status, two_steps) == (2, [])
+    assert f"another commissioning (process {os.getpid()}" in text
+    assert not record.exists()
+
+
+@pytest.mark.parametrize("name", ["commissioned.toml", "found.toml", "commissioning.html"])
+def test_a_file_that_no_commissioning_wrote_is_not_overwritten(
+    commission, two_steps, tmp_path, name
+):
+    path = tmp_path / f"fit-mock.{name}"
+    path.write_text("precious")
+    status, text = commission("--yes", "--until", "one")
+
+    assert (status, two_steps) == (2, [])
+    assert f"{path.name}: exists, and `fitctl commission` has not written it" in text
+    assert path.read_text() == "precious"
+
+
+def test_without_its_record_a_commissioning_begins_anew_over_its_own_files(
+    commission, two_steps, tmp_path
+):
+    assert commission("--yes", "--until", "one")[0] == 0
+    (tmp_path / "fit-mock.commissioning.json").unlink()
+
+    assert commission("--yes", "--until", "one")[0] == 0
+    assert two_steps == ["one", "one"]
+
+
+def test_a_name_that_no_rig_file_can_hold_is_refused_in_one_line(commission, two_steps, tmp_path):
+    odd = tmp_path / os.fsdecode(b"bad\xff.toml")
+    odd.write_bytes(default_rig_path().read_bytes())
+    status, text = commission("--yes", "--rig", str(odd), "--until", "one")
+
+    assert (status, two_steps) == (2, [])
+    assert "its name is not UTF-8" in text
+    assert text.count("\n") == 1
+    assert list(tmp_path.iterdir()) == [odd]
 
 
 @pytest.mark.long

@@ -20,7 +20,7 @@ from fitctl.tui.app import ConsoleApp
 from fitctl.tui.commands import VIEWS
 from fitctl.tui.loops.fringes import fringe_line
 from fitctl.tui.rewind import logged as logged_module
-from fitctl.tui.rewind.logged import LoggedRun
+from fitctl.tui.rewind.logged import LoggedRun, _state_of
 from fitctl.tui.rewind.moment import state_of
 from fitctl.tui.rewind.player import Player
 from fitctl.tui.state import ConsoleState
@@ -182,8 +182,24 @@ def test_what_is_no_log_is_refused_in_words(tmp_path, content):
 
 NUMBERS = [float("nan"), float("inf"), -1e300, 1e14, -1.0, 0.0, 1e-30, 3.7]
 WHOLE = [0, -1, 2**62, 10**14, 40_000, -(2**31)]
-TEXTS = ["", "\x1b[2J\x1b]0;x\x07", "x" * 100_000, "\u202e", "right", "[red]x[/]", "VERNIER"]
+TEXTS = ["", "\x1b[2J\x1b]0;x\x07", "x" * 4_000, "\u202e", "right", "[red]x[/]", "[/", "VERNIER"]
 PACKED = [b"", b"\xff" * 100, b"\x80", msgspec.msgpack.encode({"loops": []})]
+
+
+def test_a_snapshot_with_a_text_that_no_supervisor_writes_is_left_out():
+    """Each panel draws such a text anew several times a second."""
+    message = FakeSupervisor().message()
+    fits, too_long = (
+        Snapshot(
+            time_s=0.0,
+            state_msgpack=msgspec.msgpack.encode(
+                msgspec.structs.replace(message, stopped_by="x" * length).unlogged
+            ),
+        )
+        for length in (4_000, 4_001)
+    )
+    assert _state_of(fits) is not None
+    assert _state_of(too_long) is None
 
 
 class Hostile:

@@ -284,10 +284,23 @@ def test_a_time_is_typed(text, ago_s):
     run(scenario)
 
 
-@pytest.mark.parametrize("text", ["", "noon", "1:2:3:4", "25:00:00", "nan", "-inf", "10:00"])
+@pytest.mark.parametrize(
+    "text",
+    ["", "noon", "1:2:3:4", "25:00:00", "nan", "-inf", "10:00", "03:60:00", "03:00:60", "-1:99"],
+)
 def test_what_is_no_time_is_refused(text):
     async def scenario(app, _pilot):
         assert app.playback.time_of(text) is None
+        assert app.playback.refused(text) == "a time is 03:14:07, or -2:30"
+
+    run(scenario)
+
+
+def test_a_time_before_the_oldest_data_is_refused_with_theirs():
+    async def scenario(app, _pilot):
+        assert app.playback.refused("-0:10") == ""
+        why = "the oldest data here are of 07:00:00; older data are in the log"
+        assert app.playback.refused("-1:00") == app.playback.refused("03:00:00") == why
 
     run(scenario)
 

@@ -200,6 +200,31 @@ def test_a_file_of_ones_own_is_opened(tmp_path):
 
 
 @pytest.mark.long
+def test_a_file_name_that_is_too_long_is_refused_in_the_dialog():
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "4", "f")
+        app.screen.query_one(Input).value = 300 * "x"
+        await pressed(app, pilot, "enter")
+        assert isinstance(app.screen, Ask)
+
+    run(scenario)
+
+
+@pytest.mark.long
+def test_what_the_question_names_is_run_though_another_file_is_read_meanwhile():
+    async def scenario(app, pilot):
+        await pressed(app, pilot, "4", "down")
+        named = app.view.query_one(SequenceList).document
+        await pressed(app, pilot, "g")
+        app.view._add([{"file": "other.yaml", "name": "other", "description": "", "steps": []}])
+        assert app.view.query_one(SequenceList).document["name"] == "other"
+        await pressed(app, pilot, "y")
+        assert app.jobs[-1].arguments[:3] == ["sequence", "run", named["file"]]
+
+    run(scenario)
+
+
+@pytest.mark.long
 def test_a_file_that_cannot_be_read_does_not_take_the_place_of_what_moves_the_stages(tmp_path):
     path = tmp_path / "mine.toml"
     path.touch()
