@@ -12,6 +12,7 @@ from typing import ClassVar, NamedTuple
 import msgspec
 
 from fitctl.logging.folder import is_kept
+from fitctl.text import plain
 from fitctl.tui.inks import DIM, GREEN, INK, ORANGE, SKY, WHITE
 from fitctl.tui.jobs import Job
 from fitctl.tui.look import Line, duration, shorten, text, width
@@ -81,12 +82,13 @@ class Summaries:
 
     def _collect(self, job: Job) -> None:
         ended = job.status is not None  # before its text is read: then that is all
-        by_path = {str(log.path): log for log in self._asked}
+        # JSON has a name that is not UTF-8 only as `plain` shows it.
+        by_path = {plain(str(log.path)): log for log in self._asked}
         for line in job.text().splitlines():
             with contextlib.suppress(msgspec.MsgspecError):  # the last one may be half a line
                 summary = msgspec.json.decode(line, type=LogSummary)
-                if summary.path in by_path:
-                    self._known[by_path[summary.path]] = summary
+                if log := by_path.get(plain(summary.path)):
+                    self._known[log] = summary
         if ended:
             for log in self._asked:  # what is not known now will not be
                 self._known.setdefault(log, None)

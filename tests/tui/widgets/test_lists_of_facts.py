@@ -1,12 +1,14 @@
 """What the lists show beside names: limits used, courses, summaries of logs, durations of sequences, help."""
 
 import json
+import os
 
 import msgspec
 import pytest
 
 from fitctl.messages.commands import SequenceStatus
 from fitctl.messages.telemetry import TrippedInterlock
+from fitctl.text import json_bytes
 from fitctl.tui.alarms import AlarmBook
 from fitctl.tui.commands import KEYS
 from fitctl.tui.views.help import all_sections, matching, now_section
@@ -159,6 +161,18 @@ def test_logs_are_read_by_one_process_at_a_time_and_each_once(tmp_path):
     grown = [logs[1]._replace(size_bytes=2000), *logs[2:]]
     summaries.ask(start, grown, "0.mcap")
     assert jobs[2].arguments[5:] == [str(logs[1].path)]
+
+
+@pytest.mark.parametrize("name", [os.fsdecode(b"c\xff.mcap"), "c\x01é.mcap"], ids=ascii)
+def test_a_log_of_any_name_gets_its_summary(tmp_path, name):
+    log = LogFile(tmp_path / name, 1000, 1e9, kept=False)
+    summaries, job = Summaries(), Job([])
+    summaries.ask(lambda _: job, [log], "")
+    printed = json_bytes(json.loads(line(log))).decode()
+    job.printed, job.status = f"{printed}\n", 0
+    summaries.ask(lambda _: job, [log], "")
+
+    assert summaries.of(log).rms == {"right": "0.021 px"}
 
 
 @pytest.mark.parametrize("columns", [78, 118])
