@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from pathlib import Path
 from typing import Annotated
 
@@ -37,8 +38,9 @@ def figures(
     require_loop("figures", settings, loop)
     try:
         out.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=out).close()  # known before minutes of work
     except OSError as error:
-        msg = f"figures: --out {out}: cannot be made a folder: {error.strerror}; name one you may write in"
+        msg = f"figures: --out {out}: no folder to write in: {error.strerror}; name one you may write in"
         raise ConfigError(msg) from None
     amount = QUICK if quick else FULL
     try:
