@@ -16,7 +16,7 @@ from fitctl.messages.modes import Mode
 from fitctl.messages.telemetry import Telemetry
 from fitctl.messages.waiting import RECEIVE_S, SILENCE_S
 from fitctl.sequences.links import Link
-from fitctl.sequences.view import SequenceError, View
+from fitctl.sequences.view import SequenceError, View, reason_of
 
 MESSAGE_CHARS = 300
 _REPORT_S = 1.0
@@ -56,6 +56,7 @@ class Contact:
         self.status = SequenceStatus(run=uuid.uuid4().hex, name=name, state="running", steps=steps)
         self.link = link
         self.rig = rig
+        self.loops: dict[str, None] = {}  # that had a step, in their order
         self._on_status = on_status
         self._wanted = "run"
         self._reported_s = 0.0
@@ -105,7 +106,7 @@ class Contact:
         Raises
         ------
         Stopped
-            If the loop is made SAFE, or somebody stops the sequence.
+            If the loop, or one that had a step before, is made SAFE, or somebody stops the sequence.
         """
         view.update(self._receive(), paused=paused)
         self._obey(view)
@@ -128,10 +129,15 @@ class Contact:
                 raise ConnectionError(msg)
 
     def _obey(self, view: View) -> None:
-        if view.mode is Mode.SAFE:
-            # Nothing is commanded any more: SAFE has the last word.
-            msg = f"loop {view.loop_name} is SAFE: {view.why}; remove the cause, then: fitctl send recover"
-            raise Stopped(msg, release=False)
+        had_steps = (loop for loop in view.telemetry.loops if loop.name in self.loops)
+        for loop in (view.loop, *had_steps):
+            if loop.mode == Mode.SAFE.name:
+                # Nothing is commanded any more: SAFE has the last word.
+                why = reason_of(loop)
+                msg = (
+                    f"loop {loop.name} is SAFE: {why}; remove the cause, then: fitctl send recover"
+                )
+                raise Stopped(msg, release=False)
         if self.stop_wanted.is_set():
             msg = "stopped by its program"
             raise Stopped(msg, release=True)

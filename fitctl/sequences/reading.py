@@ -13,7 +13,13 @@ from fitctl.config import ConfigError, Rig
 from fitctl.config.base import Settings, must_be
 from fitctl.config.reading import parse_override
 from fitctl.sequences.behaviours.table import problems
-from fitctl.sequences.files import read_document, read_table, shipped_sequences
+from fitctl.sequences.files import (
+    read_document,
+    read_table,
+    shipped_sequences,
+    shortened,
+    shown,
+)
 from fitctl.sequences.steps import (
     RENAMED_KEYS,
     RENAMED_STEPS,
@@ -61,13 +67,21 @@ def read_sequence(path: Path, overrides: Iterable[str] = ()) -> Sequence:
     """
     names = ", ".join(file.stem for file in shipped_sequences())
     document = read_document(path, f"no such sequence file; shipped are {names}")
+    steps = document.get("steps")
+    if isinstance(steps, list):
+        steps = document["steps"] = [_own(s) if isinstance(s, dict) else s for s in steps]
     for override in overrides:
         _override(document, override)
-    steps = document.get("steps")
     for number, step in enumerate(steps if isinstance(steps, list) else [], start=1):
         if isinstance(step, dict) and step.get("step") == "stars":
             step.update(_stars_of_file(step, path.parent, f"{path}: step {number} (stars)"))
     return sequence_from_document(document, str(path))
+
+
+def _own(step: Mapping[str, Any]) -> dict[str, Any]:
+    """A copy: an alias in YAML gives one dictionary for several steps. Its name is a text that can be shown."""
+    name = step.get("step", "")
+    return dict(step) if isinstance(name, str) else {**step, "step": shown(name)}
 
 
 def _override(document: Mapping[str, Any], text: str) -> None:
@@ -80,8 +94,13 @@ def _override(document: Mapping[str, Any], text: str) -> None:
     }
     meant = [s for number, s in steps.items() if parts[1:2] in ([number], [s.get("step")])]
     if len(parts) != 3 or not meant:
-        have = ", ".join(f"{number} ({step.get('step')})" for number, step in steps.items())
-        msg = f"--set {text}: expected steps.NUMBER.key=value or steps.NAME.key=value; there are {have}"
+        have = ", ".join(
+            f"{number} ({shortened(str(step.get('step')))})" for number, step in steps.items()
+        )
+        msg = (
+            f"--set {shortened(text)}: expected steps.NUMBER.key=value or steps.NAME.key=value; "
+            f"there are {have}"
+        )
         raise ConfigError(msg)
     for step in meant:
         step[parts[2]] = value
@@ -120,14 +139,17 @@ def make_step(kind: type[Step], keys: Mapping[str, Any]) -> Step:
 
 
 def _stars_of_file(keys: Mapping[str, Any], folder: Path, where: str) -> dict[str, Any]:
-    """The stars of the file that a step names, if it names one; errors name the step as `where`."""
+    """What replaces the file that a step names, if it names one: its stars; errors name the step as `where`.
+
+    The step then names no file, so that it is the same step when it is written and read again.
+    """
     file = keys.get("file")
     if not isinstance(file, str) or not file:
         return {}
     if keys.get("stars") is not None:
-        msg = f"{where}: has both stars and file ({file}); expected one of them"
+        msg = f"{where}: has both stars and file ({shortened(file)}); expected one of them"
         raise ConfigError(msg)
-    return {"stars": [star.model_dump() for star in read_stars(folder / file)]}
+    return {"stars": [star.model_dump() for star in read_stars(folder / file)], "file": ""}
 
 
 def read_stars(path: Path) -> list[Star]:
@@ -160,7 +182,7 @@ def _place(origin: str, place: tuple[Any, ...]) -> tuple[str, type[Settings], st
 
 
 def _key(place: tuple[Any, ...]) -> str:
-    return ".".join(str(part) for part in place)
+    return ".".join(shortened(str(part)) for part in place)
 
 
 def _mistake(where: str, kind: type[Settings], key: str, problem: Mapping[str, Any]) -> str:
@@ -170,7 +192,7 @@ def _mistake(where: str, kind: type[Settings], key: str, problem: Mapping[str, A
             mistake = f"step is missing. Available: {', '.join(STEPS)}"
         case "union_tag_invalid":
             tag = problem["ctx"]["tag"]
-            mistake = f"unknown step {tag!r}. Available: {', '.join(STEPS)}"
+            mistake = f"unknown step {shown(tag)}. Available: {', '.join(STEPS)}"
             if tag in RENAMED_STEPS:
                 mistake = f"step {tag!r} is now {RENAMED_STEPS[tag]!r}"
         case "extra_forbidden":
@@ -184,8 +206,8 @@ def _mistake(where: str, kind: type[Settings], key: str, problem: Mapping[str, A
             mistake = f"{key}: is missing"
         case _:
             given = problem.get("input")
-            shown = f" (is {given!r})" if isinstance(given, str | int | float) else ""
-            message = must_be(problem) + shown
+            what = f" (is {shown(given)})" if isinstance(given, str | int | float) else ""
+            message = must_be(problem) + what
             mistake = f"{key}: {message}" if key else message
             if isinstance(given, str) and (key, given) in RENAMED_VALUES:
                 mistake += f"; {given} is now {RENAMED_VALUES[key, given]}"

@@ -46,7 +46,6 @@ class Runner:
         self.contact = contact
         self._link = contact.link
         self._rig = contact.rig
-        self._loops: dict[str, None] = {}  # in their order
         self._star = ""  # of a list, that the step is for
         self._moves_collector = False  # by a step of this sequence
         self._motion_goes_on = motion_goes_on
@@ -54,7 +53,7 @@ class Runner:
     def hold_stages(self) -> None:
         """Stop tracking with every loop that had a step; one that does not track refuses, and may."""
         with suppress(ConnectionError):
-            for name in self._loops:
+            for name in self.contact.loops:
                 self._link.send(Release(loop=name))
 
     def stop_collector(self, *, done: bool) -> None:
@@ -71,7 +70,7 @@ class Runner:
         SequenceError
             If no attempt succeeds.
         Stopped
-            If the loop is made SAFE, or somebody stops the sequence.
+            If the loop, or one that had a step before, is made SAFE, or somebody stops the sequence.
         """
         number = self.contact.status.step_number + 1
         wrong = problems(step, self._rig)
@@ -80,7 +79,7 @@ class Runner:
             raise SequenceError(msg)
         loop_names = loops_of(step, self._rig)
         if BEHAVIOURS[step.step].loops != "none" or len(self._rig.loops) == 1:
-            self._loops.update(dict.fromkeys(loop_names))
+            self.contact.loops.update(dict.fromkeys(loop_names))
         if isinstance(step, Stars):
             return self._run_stars(step, loop_names[0], number)
         if isinstance(step, Collector) and step.action == "stop":

@@ -152,8 +152,7 @@ class View:
     @property
     def why(self) -> str:
         """The reason of the loop's last change of mode."""
-        change = self.loop.last_change
-        return "" if change is None else change.reason
+        return reason_of(self.loop)
 
     def ask(self, command: AnyCommand) -> Reply:
         """Give a command that may be refused."""
@@ -215,6 +214,11 @@ class View:
     def tracking(self) -> bool:
         """The stages follow a star or a beam, or search for one."""
         return self.mode in TRACKING | HOLDING
+
+
+def reason_of(loop: LoopState) -> str:
+    """The reason of a loop's last change of mode."""
+    return "" if loop.last_change is None else loop.last_change.reason
 
 
 def columns(measurements: list[Measurement]) -> Floats:

@@ -15,15 +15,20 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import Rig
+from fitctl.config import ConfigError, Rig
 from fitctl.logging.records import AnyRecord, Event, MetrologyTick, Tick
+from fitctl.messages.command_table import WORDS
 from fitctl.messages.commands import (
     Acquire,
     AnyCommand,
+    RecentEvents,
     SetBiasOffset,
     SetTarget,
+    Shutdown,
     Standby,
+    Status,
     Stop,
+    TakeOver,
 )
 from fitctl.messages.modes import HOLDING, POINTING, Mode
 from fitctl.messages.telemetry import LoopState, Telemetry
@@ -34,12 +39,34 @@ SETTLE_S = 3.0
 AFTER_S = 20.0  # how long the stages are followed after a command, at least
 LONGEST_S = 120.0  # and while it is under way
 STEP_S = 0.1
+# They are for a supervisor's process and its clients, of which a simulation has none.
+NOT_REHEARSED = (Shutdown, Status, RecentEvents, TakeOver)
 
 Pair = tuple[float, float]
 
 
 class RehearsalError(Exception):
     """A rehearsal cannot be made, and why."""
+
+
+def require_rehearsable(command: AnyCommand) -> None:
+    """Refuse a command that a simulation cannot follow.
+
+    Raises
+    ------
+    ConfigError
+        If it is such a command; the text names those that can be rehearsed.
+    """
+    if isinstance(command, NOT_REHEARSED):
+        word = next(word for word, row in WORDS.items() if row.make is type(command))
+        can_be = ", ".join(
+            word for word, row in WORDS.items() if not issubclass(row.make, NOT_REHEARSED)
+        )
+        msg = (
+            f"rehearse: {word} is for the supervisor's process, which is not simulated. "
+            f"Available: {can_be}"
+        )
+        raise ConfigError(msg)
 
 
 class Present(NamedTuple):

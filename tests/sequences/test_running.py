@@ -186,6 +186,32 @@ def test_stop_ends_the_sequence_at_once_and_has_the_last_word(tried):
     assert len(run.link.commands) == given  # nothing was commanded
 
 
+@pytest.mark.parametrize(
+    "step", [{"step": "wait", "duration_s": 60.0}, {**ACQUIRE, **ELSEWHERE, "loop": "right"}]
+)
+def test_safe_of_any_loop_that_had_a_step_ends_the_sequence_at_once(tried, step):
+    run = tried(rig="fit-testbed.toml")
+    first, other = list(run.rig.loops)[:2]
+    run.link.meddling = [(3.0, Stop(loop=other))]
+
+    run({"step": "standby", "loop": other}, step, {"step": "standby", "loop": first})
+
+    assert run.outcomes() == ["done", "stopped"]
+    assert run.attempts[-1].ended_s < 3.5
+    assert f"loop {other} is SAFE" in run.error
+    assert not any(isinstance(command, Release) for command in run.link.commands)
+
+
+def test_safe_of_a_loop_that_had_no_step_ends_no_sequence(tried):
+    run = tried(rig="fit-testbed.toml")
+    first, other = list(run.rig.loops)[:2]
+    run.link.meddling = [(3.0, Stop(loop=other))]
+
+    run({"step": "standby", "loop": first}, {"step": "wait", "duration_s": 5.0})
+
+    assert (run.outcomes(), run.error) == (["done", "done"], "")
+
+
 def test_the_operator_stops_it_and_the_stages_are_held(tried):
     run = tried()
     run.link.meddling = [(15.0, SequenceControl(action="end"))]

@@ -10,7 +10,13 @@ from hypothesis import strategies as st
 from fitctl.config import ConfigError, default_rig_path, load_rig
 from fitctl.sequences.behaviours.table import BEHAVIOURS
 from fitctl.sequences.files import find_sequence, parse_yaml, shipped_sequences
-from fitctl.sequences.reading import STEPS, load_sequence, sequence_from_document
+from fitctl.sequences.reading import (
+    STEPS,
+    load_sequence,
+    make_step,
+    read_sequence,
+    sequence_from_document,
+)
 
 RIG = load_rig(default_rig_path())
 HEAD = 'schema_version = 1\nname = "tried"\ndescription = "Of a test."\n'
@@ -153,6 +159,55 @@ def test_a_mistake_in_yaml_is_one_line_that_says_where(tmp_path, text, said):
     assert said in line
 
 
+@pytest.mark.parametrize("suffix", WRITTEN)
+def test_a_byte_order_mark_is_no_part_of_a_sequence(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    path.write_text(WRITTEN[suffix], encoding="utf-8-sig")
+
+    assert load_sequence(path, RIG).steps[0].duration_s == 5.0
+
+
+HUGE = "0x" + 4000 * "F"  # Python writes no number of more than 4300 digits
+LONG = 4000 * "y"
+
+
+@pytest.mark.parametrize(
+    ("step", "said"),
+    [
+        ("step: wait, duration_s: HUGE", "duration_s: must be a valid number (is a number of"),
+        ("step: HUGE", "unknown step 'a number of thousands of digits'"),
+        ("step: off, ? HUGE : 1", "Keys should be strings"),
+        ("step: LONG", f"unknown step '{59 * 'y'}…. Available: standby"),
+        ("step: off, loop: LONG", f"loop '{59 * 'y'}…: rig fit-mock has right"),
+        ("step: off, loop: [LONG]", "loop: must be a valid string"),
+        ("step: wait, duration_s: LONG", f"must be a valid number (is '{59 * 'y'}…)"),
+        ("step: off, ? LONG : 1", f"{60 * 'y'}…: unknown key"),
+    ],
+)
+def test_a_long_value_is_shown_shortened(tmp_path, capfd, step, said):
+    path = tmp_path / "a.yaml"
+    step = step.replace("HUGE", HUGE).replace("LONG", LONG)
+    path.write_text(YAML_HEAD + f"steps: [{{{step}}}]")
+
+    with pytest.raises(ConfigError) as caught:
+        load_sequence(path, RIG)
+
+    assert said in str(caught.value)
+    assert len(str(caught.value).removeprefix(str(path))) < 400
+    assert capfd.readouterr().err == ""  # pydantic cannot show every number either
+
+
+def test_steps_that_are_one_in_yaml_are_read_and_changed_each_alone(tmp_path):
+    (tmp_path / "b.csv").write_text("name,az_sky_arcsec,el_sky_arcsec\nalpha,0,0\n")
+    path = tmp_path / "a.yaml"
+    path.write_text(YAML_HEAD + "steps:\n- &a {step: stars, file: b.csv}\n- *a\n")
+
+    steps = load_sequence(path, RIG, ["steps.2.duration_s=60.0"]).steps
+
+    assert [step.duration_s for step in steps] == [30.0, 60.0]
+    assert steps[0].stars == steps[1].stars
+
+
 @pytest.mark.parametrize("text", ["", "- 1", "no", "42"])
 def test_yaml_without_keys_is_no_sequence(tmp_path, text):
     path = tmp_path / "a.yaml"
@@ -237,6 +292,16 @@ def test_shipped_sequences_are_well_for_every_shipped_rig(rig):
         }.get(path.stem, len(settings.loops) == 1)
         if suits:
             assert load_sequence(path, settings).name == path.stem
+
+
+@pytest.mark.parametrize("path", shipped_sequences(), ids=lambda path: path.stem)
+def test_a_sequence_that_was_read_is_a_sequence_in_any_folder(path):
+    sequence = read_sequence(path)
+    document = sequence.model_dump(exclude_none=True)
+
+    assert sequence_from_document(document, "again.toml") == sequence
+    for step in document["steps"]:
+        assert make_step(STEPS[step["step"]], step).model_dump(exclude_none=True) == step
 
 
 def test_every_step_has_a_behaviour():

@@ -51,10 +51,11 @@ def rehearse(
     from them. Sends the command to the simulation, and prints where the stages end and which interlocks trip.
     The rig file needs a plant section. A star that is not measured now is assumed to be on its target.
     """
-    from fitctl.simulation.rehearsal import RehearsalError
+    from fitctl.simulation.rehearsal import RehearsalError, require_rehearsable
     from fitctl.simulation.rehearsal import rehearse as rehearsed
 
     wanted = command_of(command, values or [], loop, "rehearse")
+    require_rehearsable(wanted)
     if remote is None:
         found = address("rehearse", rig, overrides)
         rig, overrides = found.file, found.settings

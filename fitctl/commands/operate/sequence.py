@@ -83,8 +83,8 @@ def _addressed(file: Path, rig: Path | None, overrides: list[str] | None) -> tup
     """The rig file and overrides of the instrument that the command addresses, for a sequence."""
     from fitctl.sequences.reading import read_sequence
 
-    read_sequence(find_sequence(file))  # what is wrong with the file is reported first
     values, steps = _parted(overrides)
+    read_sequence(find_sequence(file), steps)  # what is wrong with the sequence is reported first
     found = address("sequence", rig, values)
     return found.file, [*found.settings, *steps]
 
@@ -100,7 +100,9 @@ def list_(
     files: Annotated[
         list[Path] | None,
         typer.Argument(
-            metavar="[FILE...]", help="Sequence files. [default: the shipped sequences]"
+            metavar="[FILE...]",
+            help="Sequence files, or names of shipped ones. [default: the shipped sequences]",
+            autocompletion=completion.sequences,
         ),
     ] = None,
     as_json: Annotated[
@@ -113,7 +115,8 @@ def list_(
     """List the shipped sequences."""
     from fitctl.sequences.reading import read_sequence
 
-    listed = {path: read_sequence(path) for path in files or shipped_sequences()}
+    paths = map(find_sequence, files) if files else shipped_sequences()
+    listed = {path: read_sequence(path) for path in paths}
     if as_json:
         documents = [
             {"file": str(path), **sequence.model_dump(exclude_none=True)}

@@ -14,6 +14,7 @@ from fitctl.sequences.behaviours.pointing import POINTING
 from fitctl.sequences.behaviours.scans import SCANS
 from fitctl.sequences.behaviours.stars import STARS
 from fitctl.sequences.behaviours.testbed import TESTBED
+from fitctl.sequences.files import shown
 from fitctl.sequences.steps import Step
 
 BEHAVIOURS: dict[str, Behaviour] = (
@@ -28,7 +29,7 @@ def problems(step: Step, rig: Rig) -> list[str]:
     """What is wrong with a step for a rig, without the instrument: one text each."""
     behaviour = BEHAVIOURS[step.step]
     if step.loop and step.loop not in rig.loops:
-        return [f"loop {step.loop!r}: rig {rig.name} has {', '.join(rig.loops)}"]
+        return [f"loop {shown(step.loop)}: rig {rig.name} has {', '.join(rig.loops)}"]
     if not step.loop and len(rig.loops) > 1 and behaviour.loops == "one":
         return [f"loop is missing: rig {rig.name} has {', '.join(rig.loops)}"]
     if step.loop in rig.metrology_loops and not behaviour.of_beams:

@@ -17,6 +17,7 @@ from fitctl.messages.commands import SequenceControl
 from fitctl.tui.commands import keys_of
 from fitctl.tui.dialogs import Ask
 from fitctl.tui.jobs import Job, printed_json
+from fitctl.tui.look import shorten
 from fitctl.tui.views.view import View
 from fitctl.tui.widgets.printed import Printed
 from fitctl.tui.widgets.sequencing import Estimates, Parameters, Progress, SequenceList
@@ -29,6 +30,9 @@ NEEDS_RIG = (
     "The console needs the rig file to check, rehearse and run sequences, and does not have it here. Start the "
     "console again with --rig FILE. You can pause and end a running sequence without it."
 )
+
+
+_MOST_SHOWN = 60  # characters of a value in the prompt for another
 
 
 class SequencesView(View):
@@ -129,10 +133,10 @@ class SequencesView(View):
                 sequences.edited.add(document["file"])
                 self._start(document, "check")
 
-        prompt = (
-            f"step {parameter.step + 1}, {step['step']}: {parameter.key} (is {parameter.value!r})"
-        )
-        self.app.push_screen(Ask(document["name"], prompt, str(parameter.value)), accept)
+        value = typed(parameter.value)
+        where = f"step {parameter.step + 1}, {step['step']}"
+        prompt = f"{where}: {parameter.key} (is {shorten(value, _MOST_SHOWN)})"
+        self.app.push_screen(Ask(document["name"], prompt, value), accept)
 
     def action_dry_run(self) -> None:
         """Rehearse the chosen sequence on the virtual clock, from where the stages are now."""
@@ -220,9 +224,19 @@ class SequencesView(View):
             self._run = printed.moving
 
 
+def typed(value: Any) -> str:
+    """A value as it may be typed on one line; :func:`parsed` reads it again."""
+    if isinstance(value, str) and parsed(value) == value:
+        return value
+    lines = tomli_w.dumps({"value": [value]}).split("\n")[1:-2]  # in a list, tables stay inline
+    return " ".join(line.strip(" ") for line in lines).removesuffix(",")
+
+
 def parsed(value: str) -> Any:
     """A TOML value, or, if it is none, the text itself."""
     try:
-        return tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
+        document = tomllib.loads(f"value = {value}")
+        tomli_w.dumps(document)  # it is written again for `fitctl sequence`
+    except (ValueError, RecursionError):  # also too many digits, and lists too deep
         return value
+    return document["value"]

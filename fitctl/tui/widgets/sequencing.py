@@ -168,7 +168,7 @@ class Parameters(Choice):
         steps_s = (self._sequences.durations_of(document) if document else None) or []
         for row in self.parameters():
             if row.key:
-                value = row.value if row.value != "" else "the only loop"
+                value = "the only loop" if (row.key, row.value) == ("loop", "") else row.value
                 lines.append(
                     [text(f"   {row.key:<26}", DIM), text(shorten(str(value), columns - 30), INK)]
                 )

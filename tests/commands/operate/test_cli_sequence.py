@@ -1,12 +1,15 @@
 """`fitctl sequence` as a stranger meets it."""
 
 import json
+import os
 from pathlib import Path
 
 import pytest
 import tomli_w
 
 from fitctl.cli import main
+from fitctl.config import default_rig_path
+from fitctl.messages import endpoints, running
 from fitctl.sequences.files import shipped_sequences
 from fitctl.sequences.runner import Runner
 
@@ -56,6 +59,26 @@ def test_sequences_are_listed_with_every_key_for_programs(sequence, tmp_path):
     copy = {key: value for key, value in jog.items() if key != "file"}
     path.write_text(tomli_w.dumps(copy))  # what is listed is a sequence again
     assert sequence("check", path)[0] == 0
+
+
+def test_a_list_of_stars_from_a_file_is_listed_so_that_it_can_be_read_again(sequence, tmp_path):
+    (listed,) = json.loads(sequence("list", "--json", "stars")[1])
+    copy = {key: value for key, value in listed.items() if key != "file"}
+    path = tmp_path / "tried.toml"
+    path.write_text(tomli_w.dumps(copy))
+
+    rig = default_rig_path().parent / "star-field.toml"
+    assert sequence("check", path, "--rig", rig)[0] == 0
+    (again,) = json.loads(sequence("list", "--json", path)[1])
+    assert again["steps"] == listed["steps"]
+    assert [star["name"] for star in again["steps"][0]["stars"]][:2] == ["alpha", "beta"]
+
+
+def test_a_shipped_sequence_is_listed_by_its_name(sequence):
+    status, out, _ = sequence("list", "dither", "hold")
+
+    assert status == 0
+    assert [line.split()[0] for line in out.splitlines()] == ["dither", "hold"]
 
 
 def test_check_says_every_mistake_on_a_line(sequence, tmp_path):
@@ -111,6 +134,37 @@ def test_set_changes_the_sequence_and_the_rig(sequence, tmp_path):
     assert status == 0
     assert float(out.splitlines()[-1].split()[0]) == pytest.approx(20.0, abs=0.5)
     assert "for rig other" in sequence("check", path, "--set", "name=other")[1]
+
+
+@pytest.fixture
+def nothing_runs(monkeypatch, tmp_path):
+    """No supervisor runs, whatever this machine does beside the test."""
+    monkeypatch.delenv("FITCTL_RIG", raising=False)
+    monkeypatch.setattr(endpoints, "_own_folder", lambda: tmp_path)
+    monkeypatch.setattr(running, "supervisor_names", lambda: f"fitctl-test:{os.getpid()}:")
+
+
+@pytest.mark.parametrize("command", [["run"], ["dry-run", "--present"]])
+def test_set_gives_what_the_file_lacks_also_on_the_instrument(
+    sequence, nothing_runs, tmp_path, command
+):
+    path = written(tmp_path, HEAD + 'steps = [{ step = "wait" }]\n')
+    assert sequence(*command, path)[::2] == (2, f"{path}: step 1 (wait): duration_s: is missing\n")
+
+    status, _, err = sequence(*command, path, "--set", "steps.1.duration_s=2")
+
+    assert status == 3  # the sequence has no mistake; what it is for does not run
+    assert "you have no supervisor running" in err
+
+
+@pytest.mark.parametrize("command", [["run", "dither"], ["pause"], ["resume"], ["end"]])
+def test_where_no_supervisor_runs_and_no_rig_is_named_the_status_is_3(
+    sequence, nothing_runs, command
+):
+    status, _, err = sequence(*command)
+
+    assert status == 3
+    assert "you have no supervisor running" in err
 
 
 def test_a_dry_run_that_fails_has_status_1_and_says_why(sequence, tmp_path):

@@ -43,6 +43,17 @@ def test_a_mistake_is_named_before_anything_is_simulated(fitctl):
     assert "target takes AZ_PX EL_PX" in err
 
 
+@pytest.mark.parametrize("word", ["shutdown", "status", "events", "take-over"])
+def test_what_a_simulation_cannot_follow_is_refused_with_what_it_can(fitctl, word):
+    status, out, err = fitctl("rehearse", word)
+    assert (status, out) == (2, "")
+    (line,) = err.splitlines()
+    assert f"rehearse: {word} is for the supervisor's process, which is not simulated" in line
+    available = line.partition("Available: ")[2].split(", ")
+    assert {"stop", "target", "frame-rate"} < set(available)
+    assert word not in available
+
+
 @pytest.mark.long
 def test_a_sequence_begins_where_the_stages_are(served, fitctl):
     in_vernier(served)

@@ -162,6 +162,13 @@ def test_a_list_is_csv_toml_or_yaml(tmp_path, name):
     ]
 
 
+def test_a_byte_order_mark_is_no_part_of_the_first_column(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text(FILES["a.csv"].partition("\n")[2], encoding="utf-8-sig")
+
+    assert [star.name for star in read_stars(path)] == ["alpha", "7"]
+
+
 def test_a_star_that_is_called_by_a_number_keeps_each_digit(tmp_path):
     path = tmp_path / "a.csv"
     names = ["007", "1234567", "1234568", "5853498713190525696"]

@@ -1,5 +1,6 @@
 """The screens with lists: devices and readings, sequences, logs."""
 
+import math
 import shutil
 from pathlib import Path
 
@@ -8,7 +9,7 @@ from textual.widgets import Input
 
 from fitctl.messages.commands import Reset, SequenceControl, SequenceStatus
 from fitctl.tui.dialogs import Ask, Confirm, Reader
-from fitctl.tui.views.sequences import parsed
+from fitctl.tui.views.sequences import parsed, typed
 from fitctl.tui.widgets.loglist import LogList
 from fitctl.tui.widgets.printed import Printed
 from fitctl.tui.widgets.readings import Readings
@@ -287,6 +288,35 @@ def test_what_runs_is_paused_resumed_and_ended_wherever_it_was_started(state, wa
 )
 def test_a_value_is_read_as_toml_or_as_text(text, value):
     assert parsed(text) == value
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        "right",
+        "",
+        "007",
+        "true",
+        "a # b",
+        'say "a\\b"',
+        True,
+        3,
+        0.5,
+        math.inf,
+        [1, 2.5],
+        [{"name": "a", "az": 1.0, "flux_dn": 900.0}, {"name": "b\u2028", "az": -2.0}],
+    ],
+    ids=repr,
+)
+def test_a_parameter_is_typed_as_it_is_read_again(value):
+    assert parsed(typed(value)) == value
+    assert type(parsed(typed(value))) is type(value)
+    assert "\n" not in typed(value)
+
+
+@pytest.mark.parametrize("text", ["0x" + 5000 * "F", 3000 * "["], ids=["digits", "depth"])
+def test_what_toml_cannot_read_is_a_text(text):
+    assert parsed(text) == text
 
 
 @pytest.mark.long
