@@ -167,7 +167,7 @@ class Files:
         """Write what was found, and the rig file with its comments, that includes it."""
         note = b", and laid over the rig file by its include list.\n\n"
         _write(self.found, _FOUND_MARK + note + tomli_w.dumps(found).encode())
-        document = tomlkit.parse(self._source.read_text(encoding="utf-8"))
+        document = tomlkit.parse(self._source.read_text(encoding="utf-8-sig"))
         nearby = self._source.parent.resolve() == self.rig.parent.resolve()
 
         def placed(name: str) -> str:
@@ -193,11 +193,13 @@ class Files:
 
 
 def _include_list(path: Path, document: Mapping[str, Any]) -> list[str]:
-    """The include list of a rig file, or that of the nearest rig file under it."""
+    """The include list of a rig file, or of the nearest one under it, as names from the first one's folder."""
+    folder = Path()
     while "include" not in document and "base" in document:
-        path = path.parent / str(document["base"])
-        document = tomlkit.parse(path.read_text(encoding="utf-8"))
-    return list(map(str, document.get("include", [])))
+        base = Path(str(document["base"]))
+        path, folder = path.parent / base, folder / base.parent
+        document = tomlkit.parse(path.read_text(encoding="utf-8-sig"))
+    return [str(folder / str(name)) for name in document.get("include", [])]
 
 
 def load(path: Path, rig_name: str) -> Commissioning:

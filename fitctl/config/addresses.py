@@ -19,9 +19,12 @@ BAUD_RATES = frozenset(map(int, _BAUD_RATES.split()))
 # Of python-can; others come with programs that are installed beside it.
 _CAN_INTERFACES = """
     canalystii cantact etas gs_usb iscan ixxat kvaser neousys neovi nican nixnet pcan robotell seeedstudio
-    serial slcan socketcan socketcand systec usb2can vector virtual
+    serial slcan socketcan systec usb2can vector virtual
 """
-_CAN_ON_THE_NETWORK = "udp_multicast"
+_UNFIT_CAN_INTERFACES = {
+    "udp_multicast": "its frames can leave the machine",
+    "socketcand": "it needs a host and a port beside the channel",
+}
 _LABEL = r"[A-Za-z0-9_](?:[A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?"
 _HOST_NAME = re.compile(rf"(?=.{{1,253}}$){_LABEL}(?:\.{_LABEL})*\.?")
 _HOST_AND_PORT = re.compile(r"(?:\[([0-9A-Fa-f:.]+)\]|([^\[\]:/]+)):([0-9]{1,5})")
@@ -90,8 +93,8 @@ def _baud_rate(rate: int) -> int:
 
 
 def _can_interface(name: str) -> str:
-    if name == _CAN_ON_THE_NETWORK:
-        msg = f"must not be {name}: its frames can leave the machine; choose the interface of a CAN adapter"
+    if why := _UNFIT_CAN_INTERFACES.get(name):
+        msg = f"must not be {name}: {why}; choose the interface of a CAN adapter"
         raise ValueError(msg)
     known = set(_CAN_INTERFACES.split())
     if name not in known:

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError, model_validator
 
 from fitctl.config.base import ConfigError, Finite, Name, NonNegative, Positive, Settings, must_be
+from fitctl.config.conflict import written
 from fitctl.config.devices import C887Device
 
 Vector = Annotated[list[Finite], Field(min_length=3, max_length=3)]
@@ -124,7 +125,7 @@ class CollectorMotion(Settings):
             motion = CollectorMotion.model_validate(self.model_dump() | dict(values))
         except ValidationError as error:
             wrong = [
-                f"{key}: {must_be(each)} (is {each['input']!r})"
+                f"{key}: {must_be(each)} (is {written(each['input'])})"
                 if (key := ".".join(map(str, each["loc"])))
                 else must_be(each)
                 for each in error.errors()

@@ -573,7 +573,7 @@ class Fsm(Settings):
         middle = f"from {swing_v:.4g} to {full_v - swing_v:.4g}" if 2 * swing_v <= full_v else ""
         range_part = at_most("range_rad", self.range_rad, self.range_rad * fits)
         if fits <= 0:
-            most = at_most("", 0, self.range_rad * full_v / 2 / swing_v).must_be
+            most = at_most("", 0.0, self.range_rad * full_v / 2 / swing_v).must_be
             range_part = Part("range_rad", self.range_rad, f"{most}, with bias_v {full_v / 2:g}")
         parts = [
             range_part,

@@ -22,7 +22,17 @@ from fitctl.config.base import (
     Range,
     Settings,
 )
-from fitctl.config.conflict import Conflict, Conflicts, Part, above, at_least, at_most, below
+from fitctl.config.conflict import (
+    Conflict,
+    Conflicts,
+    Part,
+    above,
+    at_least,
+    at_most,
+    below,
+    short,
+    written,
+)
 from fitctl.config.devices import AnySiderostat, Fsm
 
 ControllerName = Literal["eq20", "lqg-ltr", "minimum-variance", "fslq"]
@@ -302,7 +312,7 @@ class Logging(Settings):
         try:
             return Path(self.folder).expanduser()
         except RuntimeError as error:
-            msg = f"logging.folder: {self.folder!r}: {error}; choose another"
+            msg = f"logging.folder: {written(self.folder)}: {short(str(error))}; choose another"
             raise ConfigError(msg) from None
 
     @model_validator(mode="after")

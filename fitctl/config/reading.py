@@ -13,7 +13,7 @@ from pydantic import ValidationError
 
 from fitctl.config.base import METROLOGY, STELLAR, ConfigError, Settings, must_be
 from fitctl.config.checks import rig_conflicts
-from fitctl.config.conflict import Conflict, Conflicts
+from fitctl.config.conflict import Conflict, Conflicts, short, written
 from fitctl.config.devices import DEVICE_BY_TAG, DEVICE_TABLES
 from fitctl.config.interlocks import RENAMED_ACTIONS
 from fitctl.config.loops import CONTROLLERS
@@ -26,6 +26,10 @@ _EXAMPLE = "camera.frame_rate_hz=50.0"
 _SET = "--set"
 _MOST_BASES = 5
 _MOST_BYTES = 10 << 20
+_MOST_CHARACTERS_IN_LOG = 1 << 20
+_MOST_EXPLAINED = 50
+_LONGEST_PATH = 4096
+_LONGEST_REASON = 2000
 
 
 class LaidOver(NamedTuple):
@@ -83,14 +87,16 @@ def lay_parts(path: Path, document: dict[str, Any], overrides: Sequence[str] = (
     layers = _bases_of(path, document)
     layers.append((str(path), "", document))
     fragments: Any = []
-    for _, _, part in layers:  # the list of the uppermost file that has one
-        fragments = part.pop("include", fragments)
+    namer = path
+    for origin, _, part in layers:  # the list of the uppermost file that has one
+        if "include" in part:
+            fragments, namer = part.pop("include"), Path(origin)
     if not isinstance(fragments, list) or not all(isinstance(name, str) for name in fragments):
-        msg = f"{path}: include: must be a list of file names (is {fragments!r})"
+        msg = f"{namer}: include: must be a list of file names (is {written(fragments)})"
         raise ConfigError(msg)
-    for name in fragments:
-        missing = f"no such rig file; it is in the include list of {path}"
-        layers.append((str(path.parent / name), "include", _read_part(path.parent / name, missing)))
+    for fragment in [namer.parent / name for name in fragments]:
+        missing = f"no such rig file; it is in the include list of {namer}"
+        layers.append((str(fragment), "include", _read_part(fragment, missing)))
     laid = LaidOver({}, {})
     for depth, (origin, role, part) in enumerate(layers):
         mark_layer(laid.marks, laid.document, part, Layer(origin, role, depth))
@@ -105,12 +111,12 @@ def _bases_of(path: Path, document: dict[str, Any]) -> list[tuple[str, str, dict
     found: list[tuple[str, str, dict[str, Any]]] = []
     while (base := document.pop("base", None)) is not None:
         if not isinstance(base, str):
-            msg = f"{path}: base: must be a file name (is {base!r})"
+            msg = f"{path}: base: must be a file name (is {written(base)})"
             raise ConfigError(msg)
         if len(found) == _MOST_BASES:
             msg = (
-                f"{path}: base: {base} would be more than {_MOST_BASES} files under a rig file; see whether a "
-                "file is its own base"
+                f"{path}: base: {short(base)} would be more than {_MOST_BASES} files under a rig file; see "
+                "whether a file is its own base"
             )
             raise ConfigError(msg)
         missing = f"no such rig file; it is the base of {path}"
@@ -144,7 +150,8 @@ def read_toml(path: Path, missing: str) -> dict[str, Any]:
     try:
         return tomllib.loads(read_text(path, missing))
     except (ValueError, RecursionError) as error:  # also too many digits, and tables too deep
-        msg = f"{path}: not TOML: {error}; correct it there: expected key = value, or [table]"
+        why = short(str(error), _LONGEST_REASON)
+        msg = f"{path}: not TOML: {why}; correct it there: expected key = value, or [table]"
         raise ConfigError(msg) from None
 
 
@@ -156,19 +163,20 @@ def read_text(path: Path, missing: str) -> str:
     ConfigError
         If it is missing, cannot be read, is not a regular file or has more than 10 MiB.
     """
+    name = short(str(path), _LONGEST_PATH)
     try:
-        return read_regular(path, _MOST_BYTES).decode("utf-8").replace("\r\n", "\n")
+        return read_regular(path, _MOST_BYTES).decode("utf-8-sig").replace("\r\n", "\n")
     except FileNotFoundError:
-        msg = f"{path}: {missing}"
+        msg = f"{name}: {missing}"
         raise ConfigError(msg) from None
     except OSError as error:
         msg = (
-            f"{path}: cannot be read: {error.strerror}; give a regular text file of at most "
+            f"{name}: cannot be read: {error.strerror}; give a regular text file of at most "
             f"{_MOST_BYTES >> 20} MiB that you may read"
         )
         raise ConfigError(msg) from None
     except ValueError as error:  # no UTF-8, or a NUL in the path
-        msg = f"{path}: cannot be read: {error}; expected a text file in UTF-8"
+        msg = f"{name}: cannot be read: {error}; expected a text file in UTF-8"
         raise ConfigError(msg) from None
 
 
@@ -216,7 +224,7 @@ def rig_from_parts(laid: LaidOver, origin: str) -> Rig:
     return rig
 
 
-def _valid(laid: LaidOver, origin: str) -> Rig:
+def _valid(laid: LaidOver, origin: str, most_explained: int = _MOST_EXPLAINED) -> Rig:
     version = laid.document.get("schema_version")
     if isinstance(version, int) and version != SCHEMA_VERSION:
         # One line: many keys of the other version are missing, too.
@@ -227,20 +235,27 @@ def _valid(laid: LaidOver, origin: str) -> Rig:
                 "an older fitctl wrote this file. To write it for this one: "
                 f"fitctl rig upgrade {place}"
             )
-        msg = f"{place}: schema_version: must be {SCHEMA_VERSION} (is {version}); {why}"
+        msg = f"{place}: schema_version: must be {SCHEMA_VERSION} (is {short(str(version))}); {why}"
         raise ConfigError(plain(msg))
     try:
         return Rig.model_validate(laid.document)
     except ValidationError as error:
-        problems = error.errors()
-        misspelt = {_meant(problem) for problem in problems if problem["type"] == "extra_forbidden"}
-        lines = [
-            line
-            for problem in problems
-            if problem["type"] != "missing" or problem["loc"] not in misspelt
-            for line in _explain(laid, origin, problem)
-        ]
+        lines = _explained(laid, origin, error.errors(), most_explained)
         raise ConfigError("\n".join(map(plain, lines))) from None
+
+
+def _explained(laid: LaidOver, origin: str, problems: Sequence[Any], most: int) -> list[str]:
+    """A line for each problem, at most `most`: explaining an unknown key takes time."""
+    unknown = [problem for problem in problems if problem["type"] == "extra_forbidden"]
+    misspelt = set(map(_meant, unknown[:_MOST_EXPLAINED]))
+    apart = [
+        problem
+        for problem in problems
+        if problem["type"] != "missing" or problem["loc"] not in misspelt
+    ]
+    lines = [line for problem in apart[:most] for line in _explain(laid, origin, problem)]
+    left = len(lines[most:]) + len(apart[most:])
+    return [*lines[: most - 1], f"{lines[most - 1]} ({left} more)"] if left else lines
 
 
 def rig_from_log(text: str, origin: str, overrides: Sequence[str] = ()) -> Rig:
@@ -269,14 +284,16 @@ def rig_from_log(text: str, origin: str, overrides: Sequence[str] = ()) -> Rig:
     try:
         return _rig_in_log(text, origin, overrides)
     except ConfigError as error:
-        first, *more = str(error).splitlines()
-        also = f" ({len(more)} more)" if more else ""
+        line = plain(str(error))
         hint = "; give a rig file of this fitctl with --rig ('fitctl rig upgrade' makes one of an older file)"
-        is_own = first.startswith(f"{_SET}:")  # no other rig file would mend it
-        raise ConfigError(first + also + ("" if is_own else hint)) from None
+        is_own = line.startswith(f"{_SET}:")  # no other rig file would mend it
+        raise ConfigError(line + ("" if is_own else hint)) from None
 
 
 def _rig_in_log(text: str, origin: str, overrides: Sequence[str]) -> Rig:
+    if len(text) > _MOST_CHARACTERS_IN_LOG:
+        msg = f"{origin}: has {len(text)} characters; expected at most {_MOST_CHARACTERS_IN_LOG}"
+        raise ConfigError(msg)
     try:
         document = json.loads(text)
     except (ValueError, RecursionError) as error:
@@ -296,7 +313,7 @@ def _rig_in_log(text: str, origin: str, overrides: Sequence[str]) -> Rig:
         laid = _marked(document, origin)
         for depth, override in enumerate(overrides, start=1):
             _override(laid, override, depth)
-        return _valid(laid, origin)
+        return _valid(laid, origin, most_explained=1)
     except RecursionError:
         msg = f"{origin}: its tables are nested too deep to read; expected the tables of a rig file"
         raise ConfigError(msg) from None
@@ -331,17 +348,18 @@ def _override(laid: LaidOver, text: str, depth: int) -> None:
     loops = laid.document.get("loops")
     # One line here; a loop that this key alone would make lacks everything else.
     if parts[0] == "loops" and len(parts) > 2 and isinstance(loops, dict) and parts[1] not in loops:
-        msg = f"--set {text}: there is no loop {parts[1]}; expected one of {', '.join(loops)}"
+        there_are = short(", ".join(loops))
+        msg = (
+            f"--set {short(text)}: there is no loop {short(parts[1])}; expected one of {there_are}"
+        )
         raise ConfigError(msg)
     table: Any = laid.document
     marks: Any = laid.marks
     for length, part in enumerate(parts[:-1], start=1):
         table = table.setdefault(part, {}) if isinstance(table, dict) else None
         if not isinstance(table, dict):
-            place = ".".join(parts[:length])
-            msg = (
-                f"--set {text}: {place} is not a table; expected a value's key, such as {_EXAMPLE}"
-            )
+            place = short(".".join(parts[:length]))
+            msg = f"--set {short(text)}: {place} is not a table; expected a value's key, such as {_EXAMPLE}"
             raise ConfigError(msg)
         marks = marks.setdefault(part, {})
     last = parts[-1]
@@ -362,7 +380,7 @@ def parse_override(text: str, example: str) -> tuple[list[str], Any]:
     key, equals, value_text = text.partition("=")
     parts = key.strip().split(".")
     if not equals or not all(parts):
-        msg = f"--set {text}: expected key.path=value, for example {example}"
+        msg = f"--set {short(text)}: expected key.path=value, for example {example}"
         raise ConfigError(msg)
     try:
         return parts, tomllib.loads(f"value = {value_text}")["value"]
@@ -382,14 +400,14 @@ def _explain(laid: LaidOver, origin: str, problem: Any) -> list[str]:
     key = ".".join(location)
     # What concerns the whole file names its key itself.
     place = _place(laid, origin, location, missing=missing)
-    where = f"{place}: {key}" if key else origin
+    where = f"{place}: {short(key)}" if key else origin
     return [f"{where}: {_said(problem, location, missing=missing)}"]
 
 
 def _said(problem: Any, location: list[str], *, missing: bool) -> str:
     if problem["type"] == "union_tag_invalid":
         context = problem["ctx"]
-        return f"must be one of {context['expected_tags']} (is {context['tag']!r})"
+        return f"must be one of {context['expected_tags']} (is {written(context['tag'])})"
     if problem["type"] == "extra_forbidden":
         allowed = _allowed_keys([str(part) for part in problem["loc"][:-1]])
         meant = _meant(problem)
@@ -397,18 +415,19 @@ def _said(problem: Any, location: list[str], *, missing: bool) -> str:
         return f"unknown key{hint} (allowed here: {', '.join(allowed)})"
     if missing:
         return "is missing; a rig file that fitctl init writes has every key with its unit"
-    message = must_be(problem)
+    message = short(must_be(problem), _LONGEST_REASON)
     given = problem.get("input")
     is_value = isinstance(given, str | int | float | list)
     now = RENAMED_ACTIONS.get(str(given)) if location[-1:] == ["action"] else None
     hint = f"; {given} is now {now}" if now else ""
-    return f"{message} (is {given!r}){hint}" if is_value else message
+    return f"{message} (is {written(given)}){hint}" if is_value else message
 
 
 def _meant(problem: Any) -> tuple[Any, ...]:
     """The place of the key that an unknown one is most like; empty if it is like none."""
     *table, key = problem["loc"]
-    near = difflib.get_close_matches(str(key), _allowed_keys([str(part) for part in table]), 1)
+    allowed = _allowed_keys([str(part) for part in table])
+    near = difflib.get_close_matches(short(str(key)), allowed, 1)
     return (*table, *near) if near else ()
 
 

@@ -52,9 +52,12 @@ def places(rig: Rig) -> dict[str, Place]:
 def _is_here(at: str) -> bool:
     if at.startswith(_PTYS):
         return True
-    host = urlsplit(at if at.startswith(SOCKET_URL) else f"//{at}").hostname
     try:
-        return ip_address(host or "").is_loopback
+        host = urlsplit(at if at.startswith(SOCKET_URL) else f"//{at}").hostname or ""
+    except ValueError:  # not every CAN channel can be read as a host
+        return False
+    try:
+        return ip_address(host).is_loopback
     except ValueError:
         return host == "localhost"
 

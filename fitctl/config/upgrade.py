@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,9 +11,11 @@ from typing import Any, NamedTuple
 import tomlkit
 from pydantic import ValidationError
 from tomlkit.exceptions import ParseError
+from tomlkit.items import InlineTable
 
 from fitctl.config.base import ConfigError
 from fitctl.config.commented import dump_commented, parse_commented, set_value
+from fitctl.config.conflict import written
 from fitctl.config.interlocks import RENAMED_ACTIONS
 from fitctl.config.origins import default_rig_path, layer_of
 from fitctl.config.reading import (
@@ -104,15 +107,27 @@ def upgrade(path: Path) -> Upgrade:
         changes.append(Change(f"interlocks.{name}.action", _shown(row["action"]), f'"{was}"'))
     shipped = parse_commented(default_rig_path().read_text(encoding="utf-8"))
     for _ in range(_MOST_ROUNDS):
-        added = [_add(document, shipped, key) for key in _missing(_laid(path, document))]
+        added = [_add(path, document, shipped, key) for key in _missing(_laid(path, document))]
         changes += [change for change in added if change is not None]
         if not any(added):
             break
     for old, new in _MOVED.items():
         if new in moved:
-            _put(document, new, moved[new])
+            _put(path, document, new, moved[new])
             changes.append(Change(".".join(new), _shown(moved[new]), ".".join(old)))
-    return Upgrade(dump_commented(document), changes, _problems(path, document))
+    return Upgrade(_dumped(path, document), changes, _problems(path, document))
+
+
+def _dumped(path: Path, document: tomlkit.TOMLDocument) -> str:
+    text = dump_commented(document)
+    try:
+        is_same = tomllib.loads(text) == document.unwrap()
+    except ValueError:
+        is_same = False
+    if not is_same:  # tomlkit does not add a table under a dotted key as such
+        msg = f"{path}: its dotted keys (a.b = 1) have no place for new tables; write [a] and b = 1 instead"
+        raise ConfigError(msg)
+    return text
 
 
 def _insist_on_old(path: Path, document: tomlkit.TOMLDocument) -> None:
@@ -124,7 +139,7 @@ def _insist_on_old(path: Path, document: tomlkit.TOMLDocument) -> None:
         msg = f"{path}: has {_VERSION} {SCHEMA_VERSION} and needs no upgrade"
         raise ConfigError(msg)
     if version not in range(1, SCHEMA_VERSION + 1):
-        msg = f"{path}: {_VERSION}: expected 1 to {SCHEMA_VERSION}, is {version!r}"
+        msg = f"{path}: {_VERSION}: expected 1 to {SCHEMA_VERSION}, is {written(version)}"
         raise ConfigError(msg)
     if version != SCHEMA_VERSION and layer is not None and layer.role == "base":
         msg = (
@@ -151,7 +166,7 @@ def _missing(laid: LaidOver) -> list[tuple[str, ...]]:
 
 
 def _add(
-    document: tomlkit.TOMLDocument, shipped: tomlkit.TOMLDocument, key: tuple[str, ...]
+    path: Path, document: Any, shipped: tomlkit.TOMLDocument, key: tuple[str, ...]
 ) -> Change | None:
     """Add a missing key with the shipped rig's value and comment; None if no shipped rig has it."""
     item = _item(shipped, key)
@@ -163,7 +178,7 @@ def _add(
             value = tomlkit.item(before)
             if item.trivia.comment:
                 value.comment(item.trivia.comment)
-    _put(document, key, value)
+    _put(path, document, key, value)
     return Change(".".join(key), _shown(value))
 
 
@@ -196,13 +211,29 @@ def _taken(document: Any, key: Sequence[str]) -> Any:
     """Remove a value; returns it."""
     for part in key[:-1]:
         document = document[part]
-    return document.pop(key[-1]).unwrap()
+    value = document.pop(key[-1])
+    return value.unwrap() if hasattr(value, "unwrap") else value  # a truth value is Python's own
 
 
-def _put(document: Any, key: Sequence[str], value: Any) -> None:
-    for part in key[:-1]:
-        document = document.setdefault(part, tomlkit.table())
+def _put(path: Path, document: Any, key: Sequence[str], value: Any) -> None:
+    for depth, part in enumerate(key[:-1], start=1):
+        table = document.setdefault(part, tomlkit.table())
+        if isinstance(table, InlineTable):  # which has no place for a table or a comment
+            document[part] = _opened(table)
+            table = document[part]
+        if not isinstance(table, dict):
+            here, rest = ".".join(key[:depth]), ".".join(key[depth:])
+            msg = f"{path}: {here}: must be a table, because {rest} goes into it; correct it, then upgrade"
+            raise ConfigError(msg)
+        document = table
     document[key[-1]] = value
+
+
+def _opened(inline: InlineTable) -> Any:
+    table = tomlkit.item(inline.unwrap())
+    if inline.trivia.comment:
+        table.comment(inline.trivia.comment)
+    return table
 
 
 def _shown(value: Any) -> str:

@@ -230,7 +230,7 @@ def _read_columns(path: Path) -> list[Floats]:
         with open_regular(path) as file, zipfile.ZipFile(file) as archive:
             columns = [_unpacked(archive, name) for name in _COLUMNS]
     else:
-        with io.TextIOWrapper(open_regular(path), encoding="utf-8") as stream:
+        with io.TextIOWrapper(open_regular(path), encoding="utf-8-sig") as stream:
             header = [name.strip() for name in stream.readline().split(",")]
             missing = [name for name in _COLUMNS if name not in header]
             if missing:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import csv
 import os
-import tomllib
 from pathlib import Path
 from typing import Any
 
 from fitctl.config import ConfigError
-from fitctl.config.reading import read_text
+from fitctl.config.reading import read_text, read_toml
 
 _RENAMED = {"jog": "dither"}  # shipped sequences of an older fitctl
-_MOST_SHOWN = 60  # characters in an error
 YAML_SUFFIXES = (".yaml", ".yml")
 SUFFIXES = (".toml", *YAML_SUFFIXES)
 
@@ -53,36 +51,13 @@ def read_document(path: Path, missing: str) -> dict[str, Any]:
     ConfigError
         If it is missing, cannot be read, is not what its suffix says or has no keys.
     """
-    text = _text_of(path, missing)
     if path.suffix not in YAML_SUFFIXES:
-        try:
-            return tomllib.loads(text)
-        except (ValueError, RecursionError) as error:  # also too many digits, and tables too deep
-            msg = f"{path}: not TOML: {error}; correct it there: expected key = value, or [table]"
-            raise ConfigError(msg) from None
-    document = parse_yaml(text, path)
+        return read_toml(path, missing)
+    document = parse_yaml(read_text(path, missing), path)
     if not isinstance(document, dict):
         msg = f"{path}: must have keys, such as schema_version: 1"
         raise ConfigError(msg)
     return document
-
-
-def shortened(text: str) -> str:
-    """A text for an error, which stays one line to read."""
-    return text if len(text) <= _MOST_SHOWN else text[:_MOST_SHOWN] + "…"
-
-
-def shown(value: Any) -> str:
-    """A value for an error, as :func:`shortened`."""
-    try:
-        return shortened(repr(value))
-    except ValueError:  # Python writes no whole number of more than 4300 digits
-        return "a number of thousands of digits"
-
-
-def _text_of(path: Path, missing: str) -> str:
-    """A file's text, without the byte-order mark that some editors and spreadsheets begin it with."""
-    return read_text(path, missing).removeprefix("\ufeff")
 
 
 def parse_yaml(text: str, path: Path) -> Any:
@@ -120,7 +95,7 @@ def read_table(path: Path, key: str, missing: str) -> list[tuple[str, Any]]:
         As :func:`read_document`, or if there is no such list.
     """
     if path.suffix == ".csv":
-        return _parse_csv(_text_of(path, missing), path)
+        return _parse_csv(read_text(path, missing), path)
     rows = read_document(path, missing).get(key)
     if not isinstance(rows, list):
         msg = f"{path}: {key}: must be a list of tables, [[{key}]] in TOML"

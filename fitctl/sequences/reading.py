@@ -11,15 +11,10 @@ from pydantic import ValidationError
 
 from fitctl.config import ConfigError, Rig
 from fitctl.config.base import Settings, must_be
+from fitctl.config.conflict import short, written
 from fitctl.config.reading import parse_override
 from fitctl.sequences.behaviours.table import problems
-from fitctl.sequences.files import (
-    read_document,
-    read_table,
-    shipped_sequences,
-    shortened,
-    shown,
-)
+from fitctl.sequences.files import read_document, read_table, shipped_sequences
 from fitctl.sequences.steps import (
     RENAMED_KEYS,
     RENAMED_STEPS,
@@ -81,7 +76,7 @@ def read_sequence(path: Path, overrides: Iterable[str] = ()) -> Sequence:
 def _own(step: Mapping[str, Any]) -> dict[str, Any]:
     """A copy: an alias in YAML gives one dictionary for several steps. Its name is a text that can be shown."""
     name = step.get("step", "")
-    return dict(step) if isinstance(name, str) else {**step, "step": shown(name)}
+    return dict(step) if isinstance(name, str) else {**step, "step": written(name)}
 
 
 def _override(document: Mapping[str, Any], text: str) -> None:
@@ -95,10 +90,10 @@ def _override(document: Mapping[str, Any], text: str) -> None:
     meant = [s for number, s in steps.items() if parts[1:2] in ([number], [s.get("step")])]
     if len(parts) != 3 or not meant:
         have = ", ".join(
-            f"{number} ({shortened(str(step.get('step')))})" for number, step in steps.items()
+            f"{number} ({short(str(step.get('step')))})" for number, step in steps.items()
         )
         msg = (
-            f"--set {shortened(text)}: expected steps.NUMBER.key=value or steps.NAME.key=value; "
+            f"--set {short(text)}: expected steps.NUMBER.key=value or steps.NAME.key=value; "
             f"there are {have}"
         )
         raise ConfigError(msg)
@@ -147,7 +142,7 @@ def _stars_of_file(keys: Mapping[str, Any], folder: Path, where: str) -> dict[st
     if not isinstance(file, str) or not file:
         return {}
     if keys.get("stars") is not None:
-        msg = f"{where}: has both stars and file ({shortened(file)}); expected one of them"
+        msg = f"{where}: has both stars and file ({short(file)}); expected one of them"
         raise ConfigError(msg)
     return {"stars": [star.model_dump() for star in read_stars(folder / file)], "file": ""}
 
@@ -182,7 +177,7 @@ def _place(origin: str, place: tuple[Any, ...]) -> tuple[str, type[Settings], st
 
 
 def _key(place: tuple[Any, ...]) -> str:
-    return ".".join(shortened(str(part)) for part in place)
+    return ".".join(short(str(part)) for part in place)
 
 
 def _mistake(where: str, kind: type[Settings], key: str, problem: Mapping[str, Any]) -> str:
@@ -192,7 +187,7 @@ def _mistake(where: str, kind: type[Settings], key: str, problem: Mapping[str, A
             mistake = f"step is missing. Available: {', '.join(STEPS)}"
         case "union_tag_invalid":
             tag = problem["ctx"]["tag"]
-            mistake = f"unknown step {shown(tag)}. Available: {', '.join(STEPS)}"
+            mistake = f"unknown step {written(tag)}. Available: {', '.join(STEPS)}"
             if tag in RENAMED_STEPS:
                 mistake = f"step {tag!r} is now {RENAMED_STEPS[tag]!r}"
         case "extra_forbidden":
@@ -206,7 +201,7 @@ def _mistake(where: str, kind: type[Settings], key: str, problem: Mapping[str, A
             mistake = f"{key}: is missing"
         case _:
             given = problem.get("input")
-            what = f" (is {shown(given)})" if isinstance(given, str | int | float) else ""
+            what = f" (is {written(given)})" if isinstance(given, str | int | float) else ""
             message = must_be(problem) + what
             mistake = f"{key}: {message}" if key else message
             if isinstance(given, str) and (key, given) in RENAMED_VALUES:

@@ -376,6 +376,28 @@ def test_no_line_has_an_infinite_number_or_one_of_many_digits(key, value):
     assert not re.search(r"\binf\b|[0-9]{20}", line)
 
 
+@pytest.mark.parametrize(
+    ("interface", "why"),
+    [
+        ("udp_multicast", "its frames can leave the machine"),
+        ("socketcand", "it needs a host and a port beside the channel"),
+    ],
+)
+def test_a_can_interface_that_no_drive_can_have_is_refused_with_the_reason(interface, why):
+    line = refusal(ONE_STAR, {f"{DRIVE}.interface": interface})
+    assert line.startswith(f"my.toml: {DRIVE}.interface: must not be {interface}: {why}; choose")
+
+
+def test_an_integer_is_offered_where_an_integer_is_wanted(tmp_path):
+    line = refusal(ONE_STAR, {"logging.rotate_bytes": 1_000_000_000_000})
+    most = re.search(r"rotate_bytes: must be at most (\S+) \(", line)[1]
+    least = re.search(r"retain_bytes must be at least (\S+) \(", line)[1]
+
+    assert most.isdecimal()
+    assert least.isdecimal()
+    assert complaints(changed(ONE_STAR, {"logging.rotate_bytes": int(most)})) == []
+
+
 def test_a_spot_in_the_stars_own_window_is_refused():
     (spot,) = ONE_STAR["loops"]["right"]["other_spots"]
     near = spot | {"offset_px": {"az": 2.0, "el": -3.0}}

@@ -1,10 +1,11 @@
 """Rig files as files: what is laid over what, and by which name a mistake is told."""
 
+import json
 from pathlib import Path
 
 import pytest
 
-from fitctl.config import ConfigError, default_rig_path, load_rig
+from fitctl.config import ConfigError, default_rig_path, load_rig, reading, rig_from_log
 from fitctl.config.commented import dump_commented, parse_commented
 from fitctl.config.devices import DEVICE_TABLES
 from fitctl.config.reading import _is_tag
@@ -229,3 +230,107 @@ def test_what_lacks_in_a_table_that_set_gives_is_an_error_of_set(table):
     lines = str(raised.value).splitlines()
     assert lines
     assert [line for line in lines if not line.startswith(f"--set: {table}.")] == []
+
+
+def test_an_include_list_is_of_files_beside_the_file_that_has_it(tmp_path):
+    below = tmp_path / "sub"
+    below.mkdir()
+    shipped = default_rig_path().read_text(encoding="utf-8")
+    (below / "base.toml").write_text(f'include = ["frag.toml"]\n{shipped}')
+    (below / "frag.toml").write_text("[camera]\nframe_delay_s = 0.031\n")
+    (tmp_path / "frag.toml").write_text("[camera]\nframe_delay_s = 0.032\n")
+    mine = tmp_path / "mine.toml"
+    mine.write_text('base = "sub/base.toml"\n')
+
+    assert load_rig(mine).camera.frame_delay_s == 0.031
+    (below / "frag.toml").unlink()
+    with pytest.raises(ConfigError) as caught:
+        load_rig(mine)
+    assert str(caught.value) == (
+        f"{below / 'frag.toml'}: no such rig file; it is in the include list of {below / 'base.toml'}"
+    )
+    mine.write_text('base = "sub/base.toml"\ninclude = ["frag.toml"]\n')
+    assert load_rig(mine).camera.frame_delay_s == 0.032
+
+
+def test_a_file_that_begins_with_a_byte_order_mark_is_read(tmp_path, rig):
+    path = tmp_path / "notepad.toml"
+    path.write_bytes(b"\xef\xbb\xbf" + default_rig_path().read_bytes())
+
+    assert load_rig(path) == rig
+
+
+# ---------------------------------------------------------------- rigs that somebody made to harm
+
+
+def test_of_many_mistakes_the_first_are_explained_and_the_others_counted(tmp_path):
+    path = tmp_path / "many.toml"
+    unknown = "".join(f"frame_rate_{number} = 1\n" for number in range(10_000))
+    path.write_text(unknown + default_rig_path().read_text(encoding="utf-8"))
+
+    with pytest.raises(ConfigError) as caught:
+        load_rig(path)
+
+    lines = str(caught.value).splitlines()
+    assert len(lines) == 50
+    assert lines[0].startswith(f"{path}: frame_rate_0: unknown key")
+    assert lines[-1].endswith(" (9950 more)")
+
+
+def test_of_the_rig_in_a_log_only_the_first_mistake_is_explained(rig, monkeypatch):
+    document = json.loads(rig.model_dump_json())
+    document |= {f"frame_rate_{number}": 1 for number in range(10_000)}
+    explained = []
+    monkeypatch.setattr(
+        reading.difflib, "get_close_matches", lambda key, *_: explained.append(key) or []
+    )
+
+    with pytest.raises(ConfigError) as caught:
+        rig_from_log(json.dumps(document), "a log")
+
+    assert str(caught.value).startswith("a log: frame_rate_0: unknown key")
+    assert " (9999 more); give a rig file" in str(caught.value)
+    assert len(explained) < 100
+
+
+def test_a_rig_in_a_log_that_is_far_too_long_is_not_read(rig):
+    text = rig.model_dump_json() + " " * (1 << 20)
+
+    with pytest.raises(
+        ConfigError, match=r"a log: has [0-9]+ characters; expected at most 1048576"
+    ):
+        rig_from_log(text, "a log")
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "{0} = 1",
+        "name = '{0}'",
+        "camera = '{0}'",
+        "base = ['{0}']",
+        "include = ['{0}']",
+        "include = '{0}'",
+        "[{0}]\n[{0}]",
+        "loops.right.siderostat.device.driver = '{0}'",
+        "loops.{0}.kind = 'metrology'",
+        "interlocks.{0}.action = 'none'",
+        "[fringes]\nloops = ['{0}', '{0}']",
+    ],
+)
+def test_a_key_or_value_without_end_is_shortened_in_messages(tmp_path, line):
+    path = tmp_path / "odd.toml"
+    path.write_text(line.format("x" * 100_000))
+
+    with pytest.raises(ConfigError) as caught:
+        load_rig(path)
+
+    assert max(map(len, str(caught.value).splitlines())) < 5_000
+    assert "xxx" in str(caught.value)
+
+
+@pytest.mark.parametrize("override", ["{0}", "loops.{0}.kind=1", "name.{0}=1", "name={0}"])
+def test_so_is_what_is_set(override):
+    with pytest.raises(ConfigError) as caught:
+        load_rig(default_rig_path(), [override.format("x" * 100_000)])
+    assert len(str(caught.value)) < 1_000

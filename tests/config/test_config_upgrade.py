@@ -2,6 +2,7 @@
 
 import copy
 import json
+import re
 import tomllib
 from pathlib import Path
 
@@ -222,3 +223,71 @@ def test_a_log_of_an_older_version_is_refused_in_one_line():
     assert "\n" not in str(caught.value)
     assert str(caught.value).startswith("a log: camera.device.pixel_format: is missing")
     assert "more); give a rig file of this fitctl with --rig" in str(caught.value)
+
+
+def with_inline(table, line):
+    """The old rig with an inline table in the place of one of its tables and of those in it."""
+    place = table.rpartition(".")[0]
+    text = re.sub(rf"(?ms)^\[+{re.escape(table)}[.\]].*?(?=^\[|\Z)", "", TEXT)
+    return text.replace(f"[{place}]\n", f"[{place}]\n{line}\n", 1) if place else f"{line}\n{text}"
+
+
+@pytest.mark.parametrize(
+    ("table", "line"),
+    [
+        ("loops.right.vernier", 'vernier = { controller = "eq20" }  # mine'),
+        ("loops.right.fsm", "fsm = { bias_v = 5.0 }  # mine"),
+        ("camera", "camera = { width_px = 40 }  # mine"),
+        ("plant", "plant = {}  # mine"),
+        ("mocks", "mocks = { loops = { right = { mdt693 = { reply_s = 0.002 } } } }  # mine"),
+    ],
+)
+def test_an_inline_table_gets_the_tables_and_comments_that_it_lacks(tmp_path, table, line):
+    path = tmp_path / "mine.toml"
+    path.write_text(with_inline(table, line))
+    before = dict(values(tomllib.loads(path.read_text())))
+
+    done = upgrade(path)
+
+    after = dict(values(tomllib.loads(done.text)))
+    changed = {("schema_version",), ("supervisor", "frame_timeout_s")}
+    assert {key: after.get(key) for key in before.keys() - changed} == {
+        key: value for key, value in before.items() if key not in changed
+    }
+    assert not done.problems
+    assert "# mine" in done.text
+
+
+@pytest.mark.parametrize(
+    ("line", "place"), [("interlocks = 5\n", ""), ("", "\n[[interlocks]]\nhigh = 1.0\n")]
+)
+def test_what_is_no_table_where_a_value_moves_to_is_named(old, capsys, line, place):
+    old.write_text(line + TEXT + place)
+
+    assert run(old) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"{old}: interlocks: must be a table, because frame_missing.stale_s")
+    assert len(said.splitlines()) == 1
+
+
+def test_a_truth_value_moves_as_any_other_and_is_left_to_correct_by_hand(old):
+    old.write_text(re.sub(r"frame_timeout_s = \S+", "frame_timeout_s = true", TEXT))
+
+    done = upgrade(old)
+
+    assert tomllib.loads(done.text)["interlocks"]["frame_missing"]["stale_s"] is True
+    assert len(done.problems) == 1
+
+
+def test_dotted_keys_that_have_no_place_for_tables_are_refused(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text('schema_version = 1\nloops.right.vernier.controller = "eq20"\n')
+
+    with pytest.raises(ConfigError, match=r"its dotted keys .* write \[a\] and b = 1 instead"):
+        upgrade(path)
+
+
+@pytest.mark.parametrize("path", ["/", ".", ""])
+def test_a_folder_is_not_upgraded(capsys, path):
+    assert run(path) == 2
+    assert "cannot be read: not a regular file" in capsys.readouterr().err

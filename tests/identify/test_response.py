@@ -167,6 +167,14 @@ def test_a_file_that_is_no_bench_record_is_refused_with_what_is_expected(rig, tm
         response.read_bench(path, rig.loops["right"].fsm)
 
 
+def test_a_csv_file_may_begin_with_a_byte_order_mark_as_those_of_excel_do(rig, tmp_path):
+    path = tmp_path / "bench.csv"
+    rows = "0,1,2,3\n1,2,3,5\n2,3,4,7\n"
+    path.write_text(f"time_s,drive_v,detector_az_v,detector_el_v\n{rows}", encoding="utf-8-sig")
+
+    assert response.read_bench(path, rig.loops["right"].fsm).axis == "el"
+
+
 def test_a_clipped_detector_is_refused(records):
     clipped = dataclasses.replace(
         records[AZ], detector_v=np.full_like(records[AZ].detector_v, DETECTOR_RANGE_V)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import itertools
 import os
+import stat
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -147,7 +149,9 @@ def identify(
 def _plot_path(fragment: Path, wanted: Path | None, by: str) -> Path:
     """Where the plot goes; refuses, before minutes of an experiment, what could not be written after them."""
     _require_writable(fragment)
-    _require_own(fragment, by)
+    replaces = os.path.exists(fragment)
+    if replaces:
+        _require_own(fragment, by)
     plot = wanted or fragment.with_suffix(".png")
     if plot.suffix not in _PLOT_SUFFIXES:
         msg = f"identify: {plot}: plots are {' or '.join(_PLOT_SUFFIXES)}; name another with --plot"
@@ -156,21 +160,32 @@ def _plot_path(fragment: Path, wanted: Path | None, by: str) -> Path:
         msg = f"identify: {plot}: is both the fragment and the plot; name another with --out or --plot"
         raise ConfigError(msg)
     _require_writable(plot)
+    is_beside = plot == fragment.with_suffix(plot.suffix)
+    if os.path.exists(plot) and not (replaces and is_beside):
+        msg = (
+            f"identify: {plot}: exists already, and not beside a fragment of {by}; name another file with "
+            "--plot, or move that one away"
+        )
+        raise ConfigError(msg)
     return plot
 
 
 def _require_writable(path: Path) -> None:
-    exists = path.exists()
-    if (exists and not path.is_file()) or not os.access(path if exists else path.parent, os.W_OK):
+    try:
+        is_writable = stat.S_ISREG(path.stat().st_mode) and os.access(path, os.W_OK)
+    except FileNotFoundError:
+        is_writable = os.access(path.parent, os.W_OK)
+    except OSError:  # a name that is too long, or a folder that one may not enter
+        is_writable = False
+    if not is_writable:
         msg = f"identify: {path}: nothing can be written there; name another with --out or --plot"
         raise ConfigError(msg)
 
 
 def _require_own(path: Path, by: str) -> None:
     """Refuse a file that another command wrote; a simulated run does not replace a measured fragment either."""
-    if not path.exists():
-        return
-    with path.open("rb") as file:
+    head = ""
+    with suppress(OSError), path.open("rb") as file:
         head = file.readline(200).decode(errors="replace")
     if head.startswith(f"# Written by `{by}"):  # a measured run also replaces `... --simulate`
         return

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -14,7 +16,7 @@ from serial.tools import list_ports
 from fitctl.commands.set_up.doctor import ask_devices as run_doctor
 from fitctl.commands.shared.printing import say, say_lines
 from fitctl.commands.shared.welcome import listed
-from fitctl.config import ConfigError, rig_from_document
+from fitctl.config import ConfigError, Rig, rig_from_document
 from fitctl.config.new_rig import (
     DEVICES,
     MOCK,
@@ -86,9 +88,7 @@ def init(
         "hexapod": hexapod,
     }
     base = TESTBED if testbed else ONE_STAR
-    if file.exists():
-        msg = f"{file}: exists already, and init never overwrites a file; name another"
-        raise ConfigError(msg)
+    _require_new(file)
     for device, text in options.items():
         if text and device not in DEVICES[base]:
             msg = (
@@ -113,12 +113,10 @@ def init(
             "letter or digit; give another with --name"
         )
         raise ConfigError(msg)
-    devices = {
-        device: choice or (Chosen() if mocks else _ask(base, device))
-        for device, choice in given.items()
-    }
-    text = new_rig_text(base, name, devices)
-    rig = rig_from_document(tomllib.loads(text), str(file))
+    devices = {device: choice or Chosen() for device, choice in given.items()}
+    text, rig = _made(base, name, devices, str(file))
+    for device in [] if mocks else open_questions:
+        devices, text, rig = _asked_until_it_fits(base, name, devices, device)
     _write(file, text)
     simulated = [device for device, (kind, _) in devices.items() if kind == MOCK]
     say(f"{file}: written; rig {rig.name}, simulated: {', '.join(simulated) or 'nothing'}")
@@ -131,6 +129,33 @@ def init(
             say(line)
     say_lines(_next(file, simulated, all_mocks=all_mocks))
     raise typer.Exit(status)
+
+
+def _require_new(file: Path) -> None:
+    """Refuse, before anything is asked, a file that exists or that could not be written."""
+    try:
+        file.lstat()
+        msg = f"{file}: exists already, and init never overwrites a file; name another"
+    except FileNotFoundError:
+        if os.access(file.parent, os.W_OK | os.X_OK):
+            return
+        msg = (
+            f"{file}: cannot be written: {file.parent} is no folder, or one in which you may not write; name "
+            "another file"
+        )
+    except OSError as error:
+        msg = f"{file}: cannot be written: {error.strerror}; name another file"
+    raise ConfigError(msg)
+
+
+def _made(base: str, name: str, devices: Mapping[str, Chosen], origin: str) -> tuple[str, Rig]:
+    text = new_rig_text(base, name, devices)
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        msg = f"{origin}: an address has bytes that are no UTF-8, expected text; give another"
+        raise ConfigError(msg) from None
+    return text, rig_from_document(tomllib.loads(text), origin)
 
 
 def _must_be_a_terminal(base: str, open_questions: list[str]) -> None:
@@ -165,6 +190,18 @@ def _ask(base: str, device: str) -> Chosen:
             return chosen(base, device, answer)
         except ConfigError:
             say(f"  Expected {kinds}, or {' or '.join(forms(base, device))}; got {answer!r}.")
+
+
+def _asked_until_it_fits(
+    base: str, name: str, devices: Mapping[str, Chosen], device: str
+) -> tuple[dict[str, Chosen], str, Rig]:
+    """The devices with what is answered about one of them, and the rig that they make."""
+    while True:
+        more = {**devices, device: _ask(base, device)}
+        try:
+            return more, *_made(base, name, more, DEVICES[base][device].title)
+        except ConfigError as error:
+            say_lines("\n".join(f"  {line}" for line in str(error).splitlines()))
 
 
 def _answer(asked: Asked) -> str:

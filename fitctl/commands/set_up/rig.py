@@ -36,11 +36,11 @@ def upgrade(
     Prints each change. Values and comments of OLD stay, and OLD itself is not changed. New keys get the values
     of the shipped rig: read them before you use the file. Exit status 1 if you must correct something by hand.
     """
-    new = out or old.with_suffix(f".v{SCHEMA_VERSION}.toml")
     if out is not None and out.absolute().parent != old.absolute().parent:
         msg = f"--out {out}: must be in the folder of {old}, because a rig file names others beside it"
         raise ConfigError(msg)
     result = upgraded(old)
+    new = out or old.with_suffix(f".v{SCHEMA_VERSION}.toml")  # what has no name was no file
     try:
         with new.open("x", encoding="utf-8") as file:
             file.write(result.text)

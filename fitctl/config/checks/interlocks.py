@@ -42,7 +42,7 @@ def _age_of_frames(rig: Rig) -> Iterator[Conflict]:
                 Part(
                     "camera.frame_rate_hz",
                     camera.frame_rate_hz,
-                    above("", 0, 2 / frames_s).must_be if frames_s > 0 else "",
+                    above("", 0.0, 2 / frames_s).must_be if frames_s > 0 else "",
                 ),
             ),
         )
@@ -73,7 +73,7 @@ def _writes(rig: Rig) -> Iterator[Conflict]:
                     Part(
                         "camera.frame_rate_hz",
                         rig.camera.frame_rate_hz,
-                        above("", 0, 1 / row.high).must_be if row.high > 0 else "",
+                        above("", 0.0, 1 / row.high).must_be if row.high > 0 else "",
                     ),
                 ),
             )

@@ -47,12 +47,12 @@ def _confirmation(rig: Rig, key: str, loop: Loop | MetrologyLoop) -> Iterator[Co
                 Part(
                     "camera.frame_delay_s",
                     camera.frame_delay_s,
-                    at_most("", 0, delay_s).must_be if delay_s > 0 else "",
+                    at_most("", 0.0, delay_s).must_be if delay_s > 0 else "",
                 ),
                 Part(
                     "camera.frame_rate_hz",
                     camera.frame_rate_hz,
-                    at_least("", 0, acquisition.found_frames / frames_s).must_be
+                    at_least("", 0.0, acquisition.found_frames / frames_s).must_be
                     if frames_s > 0
                     else "",
                 ),

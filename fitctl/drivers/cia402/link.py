@@ -208,11 +208,11 @@ class CanLink:
                     ignore_config=True,
                 )
             )
-        except (can.CanError, OSError, ValueError, ImportError, NotImplementedError) as error:
+        except Exception as error:  # TypeError, NameError: each interface of python-can has its own
             raise self.endpoint.error(
                 DeviceUnreachable,
                 "an open CAN bus",
-                str(error) or type(error).__name__,
+                f"{type(error).__name__}: {error}",
                 "check that the adapter is on, and siderostat.device in the rig file",
             ) from error
 

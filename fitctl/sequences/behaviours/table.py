@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from fitctl.config import Rig
+from fitctl.config.conflict import written
 from fitctl.sequences.behaviours.acquiring import ACQUIRE
 from fitctl.sequences.behaviours.behaviour import Behaviour
 from fitctl.sequences.behaviours.dark import DARK
@@ -14,7 +15,6 @@ from fitctl.sequences.behaviours.pointing import POINTING
 from fitctl.sequences.behaviours.scans import SCANS
 from fitctl.sequences.behaviours.stars import STARS
 from fitctl.sequences.behaviours.testbed import TESTBED
-from fitctl.sequences.files import shown
 from fitctl.sequences.steps import Step
 
 BEHAVIOURS: dict[str, Behaviour] = (
@@ -29,7 +29,7 @@ def problems(step: Step, rig: Rig) -> list[str]:
     """What is wrong with a step for a rig, without the instrument: one text each."""
     behaviour = BEHAVIOURS[step.step]
     if step.loop and step.loop not in rig.loops:
-        return [f"loop {shown(step.loop)}: rig {rig.name} has {', '.join(rig.loops)}"]
+        return [f"loop {written(step.loop)}: rig {rig.name} has {', '.join(rig.loops)}"]
     if not step.loop and len(rig.loops) > 1 and behaviour.loops == "one":
         return [f"loop is missing: rig {rig.name} has {', '.join(rig.loops)}"]
     if step.loop in rig.metrology_loops and not behaviour.of_beams:

@@ -1,6 +1,7 @@
 """`fitctl identify` as a stranger meets it: what is wrong is said before anything moves."""
 
 import os
+from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import patch
 
@@ -207,3 +208,64 @@ def test_ctrl_c_ends_the_experiment_on_the_rig(rig):
         runs.on_rig(Rigged(), rig, "right", "delay", [drive], lambda _: None)
     assert [type(command) for command in given] == [Experiment, Release]
     assert given[1].loop == "right"
+
+
+@pytest.fixture
+def begun(monkeypatch):
+    """An experiment that ends as soon as it is begun."""
+
+    def end(*_):
+        msg = "begun"
+        raise IdentifyError(msg)
+
+    monkeypatch.setattr(commands, "on_simulation", end)
+
+
+@pytest.mark.parametrize("words", [[], ["--plot", "other.svg"]])
+def test_a_plot_that_is_not_beside_an_own_fragment_is_not_replaced(
+    identify, begun, tmp_path, words
+):
+    for name in ("camera.png", "other.svg"):
+        (tmp_path / name).write_text("mine")
+
+    status, err = identify("delay", "--simulate", "--out", "camera.toml", *words)
+
+    assert status == 2
+    assert f"{words[-1] if words else 'camera.png'}: exists already" in err
+    assert len(err.splitlines()) == 1
+
+
+def test_an_experiment_replaces_its_own_two_files(identify, begun, tmp_path):
+    (tmp_path / "camera.toml").write_text("# Written by `fitctl identify delay --simulate` for rig")
+    for name in ("camera.png", "camera.svg", "other.png"):
+        (tmp_path / name).touch()
+
+    by = ("delay", "--simulate", "--out", "camera.toml")
+    assert [
+        identify(*by, *words)[0]
+        for words in ([], ["--plot", "camera.svg"], ["--plot", "other.png"])
+    ] == [1, 1, 2]
+
+
+@pytest.mark.parametrize("option", ["--out", "--plot"])
+def test_a_name_that_is_too_long_for_a_file_is_one_line(identify, option):
+    status, err = identify("delay", "--simulate", option, f"{'a' * 300}.png")
+
+    assert status == 2
+    assert "nothing can be written there" in err
+    assert len(err.splitlines()) == 1
+
+
+def test_so_is_a_folder_that_one_may_not_enter(identify, monkeypatch):
+    stat = Path.stat
+
+    def refused(path, **options):
+        if path.parent.name == "closed":
+            raise PermissionError(13, "Permission denied")
+        return stat(path, **options)
+
+    monkeypatch.setattr(Path, "stat", refused)
+    status, err = identify("delay", "--simulate", "--out", "closed/a.toml")
+
+    assert status == 2
+    assert "closed/a.toml: nothing can be written there" in err

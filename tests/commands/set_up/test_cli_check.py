@@ -116,6 +116,14 @@ def test_hardware_that_a_mock_does_not_see_is_warned_of(real, warning, check):
     assert any(line.startswith("warning: ") and warning in line for line in warnings)
 
 
+@pytest.mark.parametrize("channel", ["[0", "a\u2100b"])
+def test_a_channel_that_cannot_be_read_as_a_host_is_hardware(check, channel):
+    device = "loops.right.siderostat.device"
+    lines = check("--set", f"{device}.interface=kvaser", "--set", f"{device}.channel='{channel}'")
+
+    assert "real: right siderostat; simulated: camera, right D/A, right piezo amplifier" in lines
+
+
 def test_real_motors_of_the_metrology_need_real_photodiodes():
     rig = load_rig(TESTBED, ["loops.metrology.siderostat.device.channel=/dev/ttyACM0"])
     assert any(

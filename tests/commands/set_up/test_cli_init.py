@@ -280,6 +280,9 @@ def test_a_testbed_with_photodiodes_and_hexapod_of_its_own(fitctl, tmp_path):
         (("--testbed", "--mocks", "--photodiodes", "u3:1"), "must be like one of labjack_t7:"),
         (("--mocks", "--name", "two words"), "name 'two words': expected letters"),
         (("no/such/folder/rig.toml", "--mocks"), "cannot be written"),
+        (("no/such/folder/rig.toml",), "cannot be written: no/such/folder is no folder, or one in"),
+        (("a" * 300 + ".toml", "--mocks"), "cannot be written: File name too long"),
+        (("--mocks", "--siderostat", "cia402:kvaser:\udc80"), "bytes that are no UTF-8"),
     ],
 )
 def test_what_cannot_be_is_one_line_and_no_file(
@@ -384,3 +387,77 @@ def test_at_its_end_the_devices_are_asked_and_one_that_is_not_there_shows_in_the
     assert status == 1
     assert "/dev/no-such-port" in out
     assert (tmp_path / "my-rig.toml").exists()
+
+
+def test_a_channel_that_cannot_be_read_as_a_host_is_written(fitctl, tmp_path):
+    device = ("--siderostat", "cia402:kvaser:[0")
+    status, out, _ = fitctl("init", "mine.toml", "--mocks", "--no-doctor", *device)
+
+    assert status == 0
+    assert "simulated: camera, dac, mdt693" in out
+    assert load_rig(tmp_path / "mine.toml").loops["right"].siderostat.device.channel == "[0"
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """Answers to the questions of init, in their order; what is asked is kept."""
+
+    def answer(*answers):
+        questions = []
+        left = iter(answers)
+
+        def prompt(question, **_):
+            questions.append(question.strip())
+            return next(left)
+
+        monkeypatch.setattr("sys.stdin.isatty", lambda: True)
+        monkeypatch.setattr("typer.prompt", prompt)
+        return questions
+
+    return answer
+
+
+def test_a_wrong_answer_is_asked_again_with_the_reason_and_the_others_are_kept(
+    fitctl, tmp_path, asked
+):
+    questions = asked(
+        *("night", "gige", "192.168.1.300", "gige:192.168.1.30"),
+        *("cia402", "socketcand", "can0", "mock"),
+        *("mock", "mdt693", "75", "10.0.0.5", "mdt693:75:/dev/ttyUSB2"),
+    )
+    status, out, _ = fitctl("init", "--no-doctor")
+
+    assert status == 0
+    assert "  Camera: camera.device.address: must be the IPv4 address of one device" in out
+    assert "(is '192.168.1.300')" in out
+    assert "siderostat.device.interface: must not be socketcand" in out
+    assert "fsm.piezo.port: must be a serial port" in out
+    assert len(questions) == 13
+    rig = load_rig(tmp_path / "my-rig.toml")
+    assert (rig.name, rig.camera.device.address) == ("night", "192.168.1.30")
+    assert rig.loops["right"].fsm.piezo.port == "/dev/ttyUSB2"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["no/such/folder/rig.toml"], "cannot be written"),
+        (["--camera", "gige:10.0.0.500"], "camera.device.address: must be the IPv4"),
+    ],
+)
+def test_nothing_is_asked_where_no_answer_could_help(fitctl, asked, words, said):
+    questions = asked("night")
+    status, _, err = fitctl("init", *words)
+
+    assert status == 2
+    assert said in err
+    assert questions in ([], ["Name of the rig"])
+
+
+def test_nothing_is_asked_where_one_may_not_write(fitctl, tmp_path, asked, monkeypatch):
+    questions = asked()
+    monkeypatch.setattr("os.access", lambda *_, **__: False)
+    status, _, err = fitctl("init", "mine.toml")
+
+    assert (status, questions) == (2, [])
+    assert "one in which you may not write" in err
