@@ -16,10 +16,12 @@ from fitctl.commissioning.page import flat
 from fitctl.commissioning.record import Commissioning, Entry, Files, save
 from fitctl.commissioning.tasks import Task, tasks_of
 from fitctl.config import ConfigError, Rig, load_rig
+from fitctl.config.origins import Layer, mark_layer
 from fitctl.config.reading import lay_over, read_parts, rig_from_parts
 from fitctl.daemon.locks import only_master
 from fitctl.drivers.interface import DeviceError
 
+_UPPERMOST = 1 << 16  # above all layers of the rig file, and above --set
 _TRIES = 3  # what a correction brings to light may need another
 
 
@@ -55,9 +57,11 @@ class Course(NamedTuple):
 
     def rig(self, before: str = "") -> Rig:
         """The rig file with what was found, or with what was found before a task."""
-        laid = read_parts(self.rig_path, self.overrides)
-        lay_over(laid.document, self.record.found(before, self.order))
-        return rig_from_parts(laid, str(self.rig_path))
+        try:
+            return _rig_with(self, self.record.found(before, self.order))
+        except ConfigError as error:  # the rig file alone has been read before
+            msg = f"{error}; repeat the step that found it with --only, or correct the rig file"
+            raise ConfigError(msg) from None
 
     def missing(self, task: Task) -> list[str]:
         """Tasks that must be done before this one, and are not."""
@@ -173,11 +177,18 @@ def _written(course: Course, found: dict[str, Any]) -> Rig:
     ConfigError
         If it contradicts itself; the file stays as it was.
     """
-    laid = read_parts(course.rig_path, course.overrides)
-    lay_over(laid.document, found)
-    rig = rig_from_parts(laid, str(course.rig_path))
+    rig = _rig_with(course, found)
     course.files.write_rig(found)
     return rig
+
+
+def _rig_with(course: Course, found: dict[str, Any]) -> Rig:
+    """The rig file with what was found laid over it; errors name the record for what was found."""
+    laid = read_parts(course.rig_path, course.overrides)
+    layer = Layer(str(course.files.record), "found", _UPPERMOST)
+    mark_layer(laid.marks, laid.document, found, layer)
+    lay_over(laid.document, found)
+    return rig_from_parts(laid, str(course.rig_path))
 
 
 def _settings(found: dict[str, Any]) -> tuple[str, ...]:

@@ -221,6 +221,25 @@ def test_a_rig_file_with_base_and_includes_keeps_them(tmp_path, table):
     assert kept.loops["right"].siderostat.spur_gear_ratio == 26.0
 
 
+@pytest.mark.parametrize("nearby", [True, False], ids=["beside the rig file", "elsewhere"])
+def test_an_include_list_of_a_base_elsewhere_leads_to_the_same_files(tmp_path, table, nearby):
+    """The rig files begin with the byte-order mark that some editors write."""
+    table(one=step(lambda _site: Outcome()))
+    under, out = tmp_path / "under", tmp_path if nearby else tmp_path / "out"
+    for folder in {under, out} - {tmp_path}:
+        folder.mkdir()
+    whole = default_rig_path().read_text()
+    (under / "whole.toml").write_text(f'include = ["part.toml"]\n{whole}', encoding="utf-8-sig")
+    (under / "part.toml").write_text("[camera]\nframe_rate_hz = 40.0\n")
+    rig = tmp_path / "rig.toml"
+    rig.write_text('base = "under/whole.toml"\nname = "fit-mock"\n', encoding="utf-8-sig")
+    files = Files(rig, out)
+    course = Course(rig, (), files, load(files.record, "fit-mock"), lambda _line: None)
+    do(course, task(course, "one"))
+
+    assert load_rig(files.rig).camera.frame_rate_hz == 40.0
+
+
 def test_a_rig_file_over_two_bases_keeps_the_include_list_of_the_lower_one(tmp_path, table):
     whole = default_rig_path().read_text()
     (tmp_path / "lowest.toml").write_text(f'include = ["part.toml"]\n{whole}')

@@ -174,6 +174,21 @@ def test_without_its_record_a_commissioning_begins_anew_over_its_own_files(
     assert two_steps == ["one", "one"]
 
 
+def test_what_was_found_and_contradicts_the_rig_file_now_is_named_by_its_record(
+    commission, two_steps, tmp_path
+):
+    commission("--yes", "--until", "one")
+    record = tmp_path / "fit-mock.commissioning.json"
+    document = json.loads(record.read_text())
+    document["tasks"]["right.one"]["found"] = {"camera": {"frame_delay_s": 0.105}}
+    record.write_text(json.dumps(document))
+    status, text = commission("--list", "--set", "camera.frame_rate_hz=30.0")
+
+    assert status == 2
+    assert text.startswith(f"{record}: camera.frame_delay_s: must be below 0.08333 (is 0.105)")
+    assert "repeat the step that found it with --only" in text
+
+
 def test_a_name_that_no_rig_file_can_hold_is_refused_in_one_line(commission, two_steps, tmp_path):
     odd = tmp_path / os.fsdecode(b"bad\xff.toml")
     odd.write_bytes(default_rig_path().read_bytes())
