@@ -11,13 +11,16 @@ from contextlib import ExitStack, contextmanager
 from typing import Any, NamedTuple
 from unittest.mock import patch
 
-from fitctl.config import Rig
+from fitctl.config import HALF_WINDOW_PX, Rig
+from fitctl.controllers.attribution import is_within
+from fitctl.controllers.centroid import Star
 from fitctl.controllers.position_servo import PositionServo
 from fitctl.drivers.interface import AzEl, Frame, ServoReading
 from fitctl.logging.records import StarPlace
 from fitctl.loop.loop import Loop
 from fitctl.loop.metrology import MetrologyLoop
 from fitctl.loop.observation import Observation
+from fitctl.loop.search.attribution import Attribution
 from fitctl.loop.stellar import StellarLoop
 from fitctl.messages.commands import AnyCommand, Experiment, Reply
 from fitctl.messages.modes import Mode, Trigger
@@ -166,6 +169,13 @@ def _goes_on_in(mode: Mode) -> Callable[[Loop, Mode, Any], None]:
             _ENTER(self, source, motor_rad)
 
     return enter
+
+
+def _has_left_its_place(self: Attribution, star: Star, _others: object) -> bool:
+    """Whatever is where the own star is expected is the own star."""
+    if self.candidate is None:
+        return False
+    return not is_within(*star[:2], *self.candidate[:2], HALF_WINDOW_PX)
 
 
 def _without_collector(self: Supervisor, loop: Loop, *, was_safe: bool) -> None:
@@ -338,6 +348,11 @@ DEFECTS = {
         "09991ea",
         "a loop drives its siderostat on after another loop's star, which it cannot move",
         [(StellarLoop, "_find_unmoved", lambda _self, _star: None)],
+    ),
+    "others-star": Defect(
+        "883ec1c, bbf69a4",
+        "the star of another loop that comes by itself to where the own one is expected is taken for it",
+        [(Attribution, "has_moved", _has_left_its_place)],
     ),
     "collector-in-safe": Defect(
         "fbf2d6c",

@@ -21,6 +21,11 @@ from fitctl.messages.commands import (
 from fitctl.model.drives import standstill
 from tests.benchmarks.plans import gives, plan
 
+
+def _expected(loop, az, el):
+    return Acquire(loop=loop, expected_az_sky_arcsec=az, expected_el_sky_arcsec=el)
+
+
 FAR = Acquire(expected_az_sky_arcsec=600.0, expected_el_sky_arcsec=0.0)
 BACK = Acquire(expected_az_sky_arcsec=-200.0, expected_el_sky_arcsec=0.0)
 KILLED_S = (40.0, 52.0, 64.0, 76.0)  # late in a search for a star behind a cloud
@@ -129,6 +134,22 @@ FOUND = {
             duration_s=150.0,
             rig="two-stars.toml",
             settings=slow_servos("two-stars.toml", 1),
+        ),
+        "healed, every star is held within 60 s",
+    ),
+    "others-star": (
+        plan(
+            *[gives(at_s, None) for at_s in (4.053, 4.444, 5.972, 6.208, 32.157)],
+            gives(5.633, Release(loop="right")),
+            gives(5.733, _expected("right", -134.98, 466.70)),
+            # The link comes back, and takes the star of the left loop to where the right one expects its own.
+            Strike(
+                at_s=33.061, device="metrology photodiodes", fault="loose", size=1.0, lasts_s=1.242
+            ),
+            gives(34.738, Release(loop="left")),
+            gives(34.838, _expected("left", -430.13, 224.04)),
+            duration_s=66.0,
+            rig="fit-testbed.toml",
         ),
         "healed, every star is held within 60 s",
     ),
