@@ -172,7 +172,7 @@ def _goes_on_in(mode: Mode) -> Callable[[Loop, Mode, Any], None]:
 
 
 def _has_left_its_place(self: Attribution, star: Star, _others: object) -> bool:
-    """Whatever is where the own star is expected is the own star."""
+    """Accept whatever star is where the own one is expected."""
     if self.candidate is None:
         return False
     return not is_within(*star[:2], *self.candidate[:2], HALF_WINDOW_PX)
@@ -351,7 +351,7 @@ DEFECTS = {
     ),
     "others-star": Defect(
         "883ec1c, bbf69a4",
-        "the star of another loop that comes by itself to where the own one is expected is taken for it",
+        "a search accepts another loop's star that a jog or a link moves to where its own is expected",
         [(Attribution, "has_moved", _has_left_its_place)],
     ),
     "collector-in-safe": Defect(

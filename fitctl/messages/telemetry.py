@@ -189,6 +189,11 @@ class LoopState(msgspec.Struct, frozen=True, kw_only=True):
         learnt = "" if self.learning is None else self.learning.design_json
         return learnt or self.controller_file or self.controller
 
+    @property
+    def why(self) -> str:
+        """The reason of the last change of mode; empty before the first."""
+        return "" if self.last_change is None else self.last_change.reason
+
 
 class CollectorState(msgspec.Struct, frozen=True, kw_only=True):
     """What moves the collector.

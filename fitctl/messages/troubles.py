@@ -148,7 +148,7 @@ def _of_safe(loop: LoopState) -> Iterator[Trouble]:
     if loop.mode != Mode.SAFE.name:
         return
     change = loop.last_change
-    reason = "" if change is None else change.reason
+    reason = loop.why
     fault = change is not None and change.trigger == "FAULT"
     if not fault and loop.last_failure is not None:
         return  # a stop ended a command, whose failure says so

@@ -16,7 +16,7 @@ from fitctl.messages.modes import Mode
 from fitctl.messages.telemetry import Telemetry
 from fitctl.messages.waiting import RECEIVE_S, SILENCE_S
 from fitctl.sequences.links import Link
-from fitctl.sequences.view import SequenceError, View, reason_of
+from fitctl.sequences.view import SequenceError, View
 
 MESSAGE_CHARS = 300
 _REPORT_S = 1.0
@@ -133,10 +133,7 @@ class Contact:
         for loop in (view.loop, *had_steps):
             if loop.mode == Mode.SAFE.name:
                 # Nothing is commanded any more: SAFE has the last word.
-                why = reason_of(loop)
-                msg = (
-                    f"loop {loop.name} is SAFE: {why}; remove the cause, then: fitctl send recover"
-                )
+                msg = f"loop {loop.name} is SAFE: {loop.why}; remove the cause, then: fitctl send recover"
                 raise Stopped(msg, release=False)
         if self.stop_wanted.is_set():
             msg = "stopped by its program"

@@ -149,11 +149,6 @@ class View:
         """Since the attempt began, without pauses."""
         return self.now_s - self.began_s - self.paused_s
 
-    @property
-    def why(self) -> str:
-        """The reason of the loop's last change of mode."""
-        return reason_of(self.loop)
-
     def ask(self, command: AnyCommand) -> Reply:
         """Give a command that may be refused."""
         reply = self.link.send(command)
@@ -182,7 +177,7 @@ class View:
             If the loop is in none of these.
         """
         if self.mode not in modes:
-            msg = f"loop {self.loop_name} went to {self.mode.name}: {self.why}"
+            msg = f"loop {self.loop_name} went to {self.mode.name}: {self.loop.why}"
             raise StepFailed(msg)
 
     def require_no_failure(self) -> None:
@@ -214,11 +209,6 @@ class View:
     def tracking(self) -> bool:
         """The stages follow a star or a beam, or search for one."""
         return self.mode in TRACKING | HOLDING
-
-
-def reason_of(loop: LoopState) -> str:
-    """The reason of a loop's last change of mode."""
-    return "" if loop.last_change is None else loop.last_change.reason
 
 
 def columns(measurements: list[Measurement]) -> Floats:

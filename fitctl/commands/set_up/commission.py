@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -109,7 +109,7 @@ def commission(
     files = Files(path, where)
     with ExitStack() as locked:
         if not list_steps:
-            locked.enter_context(_only_commissioning(files.record))
+            _lock(locked, files.record)
             files.require_own()
         course = Course(
             path,
@@ -143,19 +143,16 @@ def commission(
             raise typer.Exit(FAILED)
 
 
-@contextmanager
-def _only_commissioning(record: Path) -> Iterator[None]:
+def _lock(locked: ExitStack, record: Path) -> None:
     """Keep a second commissioning from the same record: each would overwrite what the other wrote."""
-    with ExitStack() as held:
-        try:
-            held.enter_context(name_held(f"fitctl-commissioning:{record.resolve()}"))
-        except BlockingIOError as error:
-            msg = (
-                f"commission: {record}: another commissioning ({error.strerror}) works on this record; end it "
-                "first, or choose another place with --folder"
-            )
-            raise ConfigError(msg) from None
-        yield
+    try:
+        locked.enter_context(name_held(f"fitctl-commissioning:{record.resolve()}"))
+    except BlockingIOError as error:
+        msg = (
+            f"commission: {record}: another commissioning ({error.strerror}) works on this record; end it "
+            "first, or choose another place with --folder"
+        )
+        raise ConfigError(msg) from None
 
 
 def _wanted(tasks: list[Task], only: list[str], until: str) -> list[Task]:

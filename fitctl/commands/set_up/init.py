@@ -132,7 +132,7 @@ def init(
 
 
 def _require_new(file: Path) -> None:
-    """Refuse, before anything is asked, a file that exists or that could not be written."""
+    """Before the first question, refuse a file that exists or cannot be written."""
     try:
         file.lstat()
         msg = f"{file}: exists already, and init never overwrites a file; name another"

@@ -60,13 +60,13 @@ def opened_loop(gathered: Gathered, loop_name: str) -> OpenedLoop:
     pieces, others = by_rate(exposed_s, pieces_of(exposed_s, usable), rig.camera.period_s)
     theory = loop_theory(rig, loop_name, present)
     mirror_rad = mirror_at_exposure_rad(loop.fsm, ticks)
-    rows = joined(pieces)
-    rows = rows[under_last_design(gathered, loop_name)[rows]]
-    error_px = axis_pair(ticks, "error_{}_px")[rows]
+    every = joined(pieces)
+    under_present = every[under_last_design(gathered, loop_name)[every]]
+    error_px = axis_pair(ticks, "error_{}_px")[under_present]
     return OpenedLoop(
         rebuild(theory, ticks, pieces, mirror_rad),
         [AtOtherRate(s, rebuild(theory, ticks, [rows], mirror_rad)) for s, rows in others],
         selection,
-        tuple(np.sqrt(np.mean(error_px**2, axis=0)).tolist()) if len(rows) else None,
+        tuple(np.sqrt(np.mean(error_px**2, axis=0)).tolist()) if len(error_px) else None,
         present,
     )

@@ -31,7 +31,7 @@ class OtherStages(NamedTuple):
     """Of another loop whose star may be on the frame, at the exposure."""
 
     moved_px: AzEl  # how far they, and a link's siderostat, move its star
-    follow: bool  # they follow it: it is no candidate of this loop
+    follow: bool  # its loop follows that star, which is then no candidate here
 
 
 class Attribution:

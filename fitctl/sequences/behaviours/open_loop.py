@@ -79,7 +79,7 @@ def open_loop(plan: Plan, name: Callable[[Any], str], evaluate: Callable[..., Re
         whole = view.elapsed_s >= experiment_s(drives)
         if not (ended_well and whole):
             trigger = Trigger[change.trigger].name.lower().replace("_", " ") if change else ""
-            msg = f"the motions ended early, in {view.mode.name}, by {trigger}: {view.why}"
+            msg = f"the motions ended early, in {view.mode.name}, by {trigger}: {view.loop.why}"
             raise StepFailed(msg)
         return evaluate(step, view, drives)
 

@@ -37,7 +37,7 @@ class Offset(NamedTuple):
 def _hold_done(step: steps.Hold, view: View) -> Result | None:
     of_beam = view.loop_name in view.rig.metrology_loops
     if view.mode not in HOLDING or view.loop.since_s > view.began_s:
-        msg = f"the {'beam' if of_beam else 'star'} was not held all the time: {view.why}"
+        msg = f"the {'beam' if of_beam else 'star'} was not held all the time: {view.loop.why}"
         raise StepFailed(msg)
     if of_beam:
         return _beam_held(step, view)

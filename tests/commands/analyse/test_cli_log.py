@@ -128,7 +128,7 @@ def test_recover_says_how_many_records_were_saved_and_overwrites_nothing(log, wh
 
 
 def test_recover_names_what_it_cannot_mend(log, whole, tmp_path):
-    """A record's own time is what it says: nobody knows which it should have been."""
+    """Recover cannot know the right time of a record whose own time is wrong."""
     tick = "/fit/right/tick"
     wrong = forged(whole, tmp_path / "wrong.mcap", lambda one: 0 if one.topic == tick else None)
 

@@ -400,7 +400,7 @@ def test_a_channel_that_cannot_be_read_as_a_host_is_written(fitctl, tmp_path):
 
 @pytest.fixture
 def asked(monkeypatch):
-    """Answers to the questions of init, in their order; what is asked is kept."""
+    """Answer the questions of init in their order; returns the list of questions."""
 
     def answer(*answers):
         questions = []
