@@ -40,7 +40,7 @@ STEPS: dict[str, Callable[[str], steps.Step]] = {
     "acquire": lambda loop: steps.Acquire(loop=loop),
     "hold": lambda loop: steps.Hold(loop=loop, duration_s=5.0, settle_s=1.0, attempts=2),
     "stars": lambda loop: steps.Stars(loop=loop, stars=_STARS, settle_s=1.0),
-    "wait": lambda _: steps.Wait(duration_s=3.0),
+    "wait": lambda _: steps.Wait(duration_s=30.0),
     "dither": lambda loop: steps.Dither(loop=loop, **_VISIT),
     "raster": lambda loop: steps.Raster(loop=loop, columns=2, rows=2, **_VISIT),
     "offset": lambda loop: steps.Offset(loop=loop, offset_az_px=0.5, offset_el_px=-0.5, **_VISIT),
@@ -243,6 +243,10 @@ class RunningSequence:
     Attributes
     ----------
     ended : bool
+    run_id : str
+        Under which the supervisor knows it.
+    loops : collection of str
+        Those that have had a step, which changes.
     """
 
     def __init__(self, link: Link, rig: Rig, loop: str, words: Sequence[str]) -> None:
@@ -250,6 +254,7 @@ class RunningSequence:
         self._link = link
         self._steps = [STEPS[word](loop) for word in words]
         self._contact = Contact(link, rig, "swarm", len(words))  # pyrefly: ignore[bad-argument-type]
+        self.run_id, self.loops = self._contact.status.run, self._contact.loops
 
     def run(self) -> None:
         """Run the sequence; called in its own thread."""

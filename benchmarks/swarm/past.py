@@ -24,6 +24,8 @@ from fitctl.loop.search.attribution import Attribution
 from fitctl.loop.stellar import StellarLoop
 from fitctl.messages.commands import AnyCommand, Experiment, Reply
 from fitctl.messages.modes import Mode, Trigger
+from fitctl.sequences.contact import Contact
+from fitctl.sequences.view import View
 from fitctl.stages.mirror import MirrorStage
 from fitctl.stages.servo import SiderostatServo
 from fitctl.stages.siderostat import SiderostatStage
@@ -69,6 +71,14 @@ def _ask_while_dac_ready(self: PiezoWatch) -> None:
 
 def _holds_any_beam(self: MetrologyLoop, sensed: Any, duration_s: float) -> None:
     self._turn_beam(self.hold.step(self._error_rad(sensed.beam), duration_s))
+
+
+def _obey_for_the_present_loop(self: Contact, view: View) -> None:
+    had_steps, self.loops = self.loops, {view.loop_name: None}
+    try:
+        _OBEY(self, view)
+    finally:
+        self.loops = had_steps
 
 
 def _oldest_frame(self: CameraWatch, _meanwhile: Callable[[], float]) -> Frame | None:
@@ -221,6 +231,7 @@ _START_SEARCH = StellarLoop._start_search
 _EVALUATE_WAITING = StellarLoop._evaluate_waiting
 _SERVO_INIT = SiderostatServo.__init__
 _FIND_POSITION = SiderostatServo._find_position
+_OBEY = Contact._obey
 _SERVO_BY = SiderostatServo._servo_by
 _POSITION_SERVO_INIT = PositionServo.__init__
 _FAIL = SiderostatServo._fail
@@ -366,6 +377,11 @@ DEFECTS = {
             (supervisor, "obey_loop_command", _experiment_though_it_waits),
             (StellarLoop, "_evaluate_waiting", _experiments_on),
         ],
+    ),
+    "sequence-in-safe": Defect(
+        "9802f29",
+        "a sequence goes on though a loop of one of its steps is SAFE, if another has the present step",
+        [(Contact, "_obey", _obey_for_the_present_loop)],
     ),
     "jog-in-off": Defect(
         "ac43419",

@@ -40,6 +40,7 @@ from fitctl.messages.commands import (
     MoveCollector,
     Off,
     Release,
+    SequenceControl,
     SetTarget,
     Stop,
     TakeOver,
@@ -70,6 +71,8 @@ _STEPS = (
 )
 # Fractions of sequences: for one loop; of a viewer, too, who is refused.
 _OF_A_LOOP, _OF_ANYBODY = 0.9, 0.1
+_MET_SEQUENCES = 0.2  # fraction of runs with sequences that are met by something while they wait,
+_MET_AFTER_S = 3.0, 12.0  # and how long after it began
 _CALIBRATING = ("experiment", "chirp", "plate_scale", "standby dark")
 _OF_TESTBED = (
     "reference collector",
@@ -226,6 +229,8 @@ def _drawn_strikes(random: Random, rig: str) -> list[Callable[[Random, float], l
         if random.random() < _EXPERIMENTS:
             met = partial(_met_experiment, loops=stars_of(rig), devices=struck, faults=faults)
             strikes += [met] * random.randint(1, 3)
+    if random.random() < _MET_SEQUENCES:
+        strikes.append(partial(_met_sequence, loops=loops))
     if random.random() < _TO_THE_END:
         strikes.append(partial(_jogged_to_the_end, loops=loops))
     if "metrology" in loops and random.random() < _COLLECTOR:
@@ -491,3 +496,13 @@ def _sequence(random: Random, at_s: float, loops: tuple[str, ...]) -> list[Happe
     loop = random.choice(stars) if random.random() < _OF_A_LOOP else ""
     who = random.choice(OPERATORS if random.random() < _OF_ANYBODY else OPERATORS[:-1])
     return [Sequence(at_s=at_s, who=who, steps=steps, loop=loop)]
+
+
+def _met_sequence(random: Random, at_s: float, loops: tuple[str, ...]) -> list[Happening]:
+    """While a sequence waits, it is ordered to end, or one of the loops is stopped."""
+    loop, who = random.choice(("", *loops)), random.choice(OPERATORS[:-1])
+    ends = SequenceControl(action="end"), Stop(loop=random.choice(loops))
+    return [
+        Sequence(at_s=at_s, who=who, steps=["standby", "wait"], loop=loop),
+        Order(at_s=at_s + random.uniform(*_MET_AFTER_S), who=who, command=random.choice(ends)),
+    ]

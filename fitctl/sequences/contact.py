@@ -56,7 +56,9 @@ class Contact:
         self.status = SequenceStatus(run=uuid.uuid4().hex, name=name, state="running", steps=steps)
         self.link = link
         self.rig = rig
-        self.loops: dict[str, None] = {}  # that had a step, in their order
+        self.loops: dict[
+            str, None
+        ] = {}  # that have had a step, in their order; also the present one
         self._on_status = on_status
         self._wanted = "run"
         self._reported_s = 0.0
@@ -106,7 +108,7 @@ class Contact:
         Raises
         ------
         Stopped
-            If the loop, or one that had a step before, is made SAFE, or somebody stops the sequence.
+            If a loop that has had a step is SAFE, or somebody stops the sequence.
         """
         view.update(self._receive(), paused=paused)
         self._obey(view)
@@ -129,10 +131,9 @@ class Contact:
                 raise ConnectionError(msg)
 
     def _obey(self, view: View) -> None:
-        had_steps = (loop for loop in view.telemetry.loops if loop.name in self.loops)
-        for loop in (view.loop, *had_steps):
-            if loop.mode == Mode.SAFE.name:
-                # Nothing is commanded any more: SAFE has the last word.
+        for loop in view.telemetry.loops:
+            if loop.name in self.loops and loop.mode == Mode.SAFE.name:
+                # No loop is commanded any more: SAFE has the last word.
                 msg = f"loop {loop.name} is SAFE: {loop.why}; remove the cause, then: fitctl send recover"
                 raise Stopped(msg, release=False)
         if self.stop_wanted.is_set():

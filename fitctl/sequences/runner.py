@@ -70,7 +70,7 @@ class Runner:
         SequenceError
             If no attempt succeeds.
         Stopped
-            If the loop, or one that had a step before, is made SAFE, or somebody stops the sequence.
+            If a loop that has had a step is SAFE, or somebody stops the sequence.
         """
         number = self.contact.status.step_number + 1
         wrong = problems(step, self._rig)
@@ -78,7 +78,7 @@ class Runner:
             msg = f"step {number} ({step.step}): {'; '.join(wrong)}"
             raise SequenceError(msg)
         loop_names = loops_of(step, self._rig)
-        if BEHAVIOURS[step.step].loops != "none" or len(self._rig.loops) == 1:
+        if step.loop or BEHAVIOURS[step.step].loops != "none" or len(self._rig.loops) == 1:
             self.contact.loops.update(dict.fromkeys(loop_names))
         if isinstance(step, Stars):
             return self._run_stars(step, loop_names[0], number)
@@ -249,7 +249,7 @@ def _ending(runner: Runner) -> Iterator[None]:
     except Stopped as stopped:
         if stopped.release:
             runner.hold_stages()
-            runner.stop_collector(done=False)
+        runner.stop_collector(done=False)
         runner.contact.end("stopped", str(stopped))
         raise SequenceError(
             str(stopped), runner.attempts[-1] if runner.attempts else None

@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.swarm.happenings import Cloud, Kill, Stall, Strike
+from benchmarks.swarm.happenings import Cloud, Kill, Sequence, Stall, Strike
 from benchmarks.swarm.past import put_back
 from benchmarks.swarm.rigs import slow_servos
 from benchmarks.swarm.run import run_plan
@@ -171,6 +171,15 @@ FOUND = {
             rig="fit-testbed.toml",
         ),
         "a loop that waited goes on at its star",
+    ),
+    "sequence-in-safe": (
+        plan(
+            Sequence(at_s=0.5, who="ada", steps=["standby", "beam_standby", "wait"], loop="right"),
+            gives(8.0, Stop(loop="metrology")),
+            duration_s=30.0,
+            rig="fit-testbed.toml",
+        ),
+        "a sequence ends if a loop that has had a step is SAFE",
     ),
     "jog-in-off": (
         plan(

@@ -9,7 +9,7 @@ import pytest
 from benchmarks.swarm.commands import LEARNT_DESIGNS
 from benchmarks.swarm.happenings import RESTARTS, Happening, Order, Strike, kind_of
 from benchmarks.swarm.instrument import RIGS as FOLDER
-from benchmarks.swarm.lines import FAULTS, WRONG
+from benchmarks.swarm.lines import FAULTS, OF_SOME_CALLS, WRONG
 from benchmarks.swarm.plan import DURATION_S, drawn_plan
 from benchmarks.swarm.rigs import (
     PHOTON_NOISE,
@@ -118,7 +118,10 @@ def test_plans_have_every_kind_of_happening():
     }
     assert struck == of_lines | wrong | {("siderostat", "power cut")}
     kinds = {happening.kind for happening in happenings}
-    assert {"D/A mute", "D/A mute at times", "D/A mute once", "stall of the supervisor"} <= kinds
+    of_devices = {kind.partition(" ")[2] for kind in kinds}
+    for fault in set(FAULTS) & set(OF_SOME_CALLS):
+        assert of_devices >= {fault, f"{fault} at times", f"{fault} once"}
+    assert "stall of the supervisor" in kinds
 
 
 def test_in_most_plans_of_the_testbed_its_loops_have_time_to_hold_their_stars():

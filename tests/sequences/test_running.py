@@ -202,12 +202,13 @@ def test_safe_of_any_loop_that_had_a_step_ends_the_sequence_at_once(tried, step)
     assert not any(isinstance(command, Release) for command in run.link.commands)
 
 
-def test_safe_of_a_loop_that_had_no_step_ends_no_sequence(tried):
+@pytest.mark.parametrize("used", [0, 1])
+def test_safe_of_a_loop_that_had_no_step_ends_no_sequence(tried, used):
     run = tried(rig="fit-testbed.toml")
-    first, other = list(run.rig.loops)[:2]
-    run.link.meddling = [(3.0, Stop(loop=other))]
+    loops = list(run.rig.loops)[:2]
+    run.link.meddling = [(3.0, Stop(loop=loops[1 - used]))]
 
-    run({"step": "standby", "loop": first}, {"step": "wait", "duration_s": 5.0})
+    run({"step": "standby", "loop": loops[used]}, {"step": "wait", "duration_s": 5.0})
 
     assert (run.outcomes(), run.error) == (["done", "done"], "")
 

@@ -82,7 +82,10 @@ class Behaviour(NamedTuple):
     of_beams: bool = False
 
 
-POWERED = frozenset(Mode) - AT_REST
+ANY = frozenset(Mode)
+"""For a step without a loop: the loop of its view is only the rig's first one."""
+
+POWERED = ANY - AT_REST
 
 
 def frames_due(duration_s: float, rig: Rig) -> int:

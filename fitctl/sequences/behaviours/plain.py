@@ -7,7 +7,7 @@ from fitctl.controllers.pair import LEARNT
 from fitctl.messages.commands import Off, Release, SetController, Standby
 from fitctl.messages.modes import Mode
 from fitctl.sequences import steps
-from fitctl.sequences.behaviours.behaviour import POWERED, Behaviour, Result, stop_tracking
+from fitctl.sequences.behaviours.behaviour import ANY, POWERED, Behaviour, Result, stop_tracking
 from fitctl.sequences.view import View
 
 
@@ -76,9 +76,7 @@ PLAIN = {
     "controller": Behaviour(
         POWERED | {Mode.OFF}, _controller_done, _run_controller, check=_check_controller
     ),
-    "wait": Behaviour(
-        POWERED | {Mode.OFF}, _wait_done, own_s=_wait_s, pausable=True, loops="none", of_beams=True
-    ),
+    "wait": Behaviour(ANY, _wait_done, own_s=_wait_s, pausable=True, loops="none", of_beams=True),
     "off": Behaviour(
         POWERED | {Mode.OFF}, _off_done, stop_tracking, loops="links last", of_beams=True
     ),

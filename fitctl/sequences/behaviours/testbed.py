@@ -8,10 +8,10 @@ import numpy as np
 
 from fitctl.config import ConfigError, Rig
 from fitctl.messages.commands import MoveCollector
-from fitctl.messages.modes import Mode
+from fitctl.messages.modes import AT_REST, Mode
 from fitctl.model.collector_motion import beyond, course_of
 from fitctl.sequences import steps
-from fitctl.sequences.behaviours.behaviour import POWERED, Behaviour, Result, frames_due
+from fitctl.sequences.behaviours.behaviour import ANY, Behaviour, Result, frames_due
 from fitctl.sequences.view import StepFailed, View
 
 _LEAST_HELD = 0.9  # of the frames that were due
@@ -79,6 +79,12 @@ def _stop_collector(step: steps.Collector, view: View) -> None:
 
 
 def _done_visibility(step: steps.Visibility, view: View) -> Result | None:
+    fringes = view.rig.fringes
+    for loop in view.telemetry.loops:
+        if fringes and loop.name in fringes.loops and Mode[loop.mode] in AT_REST | {Mode.STANDBY}:
+            both = " and ".join(fringes.loops)
+            msg = f"visibility needs the stars of {both}; loop {loop.name} is in {loop.mode}"
+            raise StepFailed(msg)
     view.measurements.clear()  # those of one star, which nothing evaluates here
     if view.elapsed_s > step.settle_s:
         due = frames_due(step.duration_s, view.rig) - view.squares.frames
@@ -125,7 +131,7 @@ def _visibility_s(step: steps.Visibility, _rig: Rig, _loop_name: str) -> float:
 
 TESTBED = {
     "collector": Behaviour(
-        POWERED | {Mode.OFF},
+        ANY,
         _done_collector,
         _run_collector,
         _stop_collector,
@@ -135,7 +141,7 @@ TESTBED = {
         of_beams=True,
     ),
     "visibility": Behaviour(
-        POWERED - {Mode.STANDBY},
+        ANY,
         _done_visibility,
         check=_check_visibility,
         own_s=_visibility_s,

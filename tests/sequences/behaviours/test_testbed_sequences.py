@@ -79,6 +79,21 @@ def test_stop_stops_the_motion_and_the_sequence(testbed):
     assert stands_still(testbed)
 
 
+def test_safe_of_a_loop_ends_the_sequence_and_the_motion_that_it_began(testbed):
+    assert testbed.link.send(Stop(loop="right")).accepted  # before the sequence
+    testbed(REFERENCE, SINE, WAIT, {"step": "standby", "loop": "right"})
+    assert testbed.outcomes() == ["done"] * 3 + ["stopped"]
+    assert stands_still(testbed)
+
+
+def test_a_visibility_without_both_stars_fails_at_once(testbed):
+    testbed({"step": "standby"}, {"step": "visibility", "duration_s": 60.0})
+    assert testbed.error.endswith(
+        "visibility needs the stars of left and right; loop right is in STANDBY"
+    )
+    assert testbed.attempts[-1].ended_s - testbed.attempts[-1].began_s < 1.0
+
+
 def test_a_step_fails_where_somebody_else_stops_the_collector(testbed):
     testbed.link.meddling = [(8.0, MoveCollector(action="stop"))]
     testbed(REFERENCE, SINE, {"step": "wait", "duration_s": 30.0})
