@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Collection, Sequence
 from random import Random
 from typing import Any
 
@@ -63,6 +64,7 @@ STEPS: dict[str, Callable[[str], steps.Step]] = {
 }
 """The steps of which operators make their sequences, for a loop."""
 _REPLY_S = 5.0
+_HAS_WAITED_S = 0.5  # what is older has waited until the sequence received it
 
 
 class Console:
@@ -168,6 +170,11 @@ class Link:
     sender : Sender
     violated : callable
         Takes what must not be, and its detail.
+
+    Attributes
+    ----------
+    loops : collection of str
+        Those that have had a step. Once the sequence has heard that one of them is SAFE, it must end.
     """
 
     def __init__(
@@ -184,6 +191,9 @@ class Link:
         self._telemetry: list[Telemetry] = []
         self._some = VirtualEvent(time)
         self._heard: SwarmService | None = None
+        self.loops: Collection[str] = ()
+        self._safe_since_s = math.inf
+        self._must_end = False
 
     def now_s(self) -> float:
         """The virtual time."""
@@ -225,7 +235,24 @@ class Link:
         if not self._telemetry:
             self._some.clear()
             self._some.wait(timeout_s)
-        return self._telemetry.pop(0) if self._telemetry else None
+        message = self._telemetry.pop(0) if self._telemetry else None
+        if message is not None:
+            self._end_if_safe(message)
+        return message
+
+    def _end_if_safe(self, message: Telemetry) -> None:
+        """Between two steps a sequence skips messages that have waited for it; of them nothing is required."""
+        if self._must_end:
+            self._violated(
+                "a sequence ends if a loop that has had a step is SAFE",
+                f"it goes on at {message.time_s:.2f} s",
+            )
+        is_safe = any(loop.name in self.loops and loop.mode == "SAFE" for loop in message.loops)
+        if not is_safe:
+            self._safe_since_s = math.inf
+        elif self._time.now_s() - message.time_s < _HAS_WAITED_S:
+            self._safe_since_s = min(self._safe_since_s, message.time_s)
+        self._must_end = message.time_s - self._safe_since_s > 2 * _HAS_WAITED_S
 
     def close(self) -> None:
         """Stop receiving telemetry."""
@@ -243,10 +270,6 @@ class RunningSequence:
     Attributes
     ----------
     ended : bool
-    run_id : str
-        Under which the supervisor knows it.
-    loops : collection of str
-        Those that have had a step, which changes.
     """
 
     def __init__(self, link: Link, rig: Rig, loop: str, words: Sequence[str]) -> None:
@@ -254,7 +277,7 @@ class RunningSequence:
         self._link = link
         self._steps = [STEPS[word](loop) for word in words]
         self._contact = Contact(link, rig, "swarm", len(words))  # pyrefly: ignore[bad-argument-type]
-        self.run_id, self.loops = self._contact.status.run, self._contact.loops
+        link.loops = self._contact.loops
 
     def run(self) -> None:
         """Run the sequence; called in its own thread."""

@@ -510,7 +510,6 @@ class Instrument:
         link = Link(self.time, lambda: self.service, SENDERS[happening.who], violated)
         sequence = RunningSequence(link, self.rig, happening.loop, happening.steps)
         self._sequences.append(sequence)
-        self.invariants.sequence_loops[sequence.run_id] = sequence.loops
         self.time.spawn(sequence.run, f"sequence at {happening.at_s:.3f} s", apart=True)
 
     def end_sequences(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -164,7 +164,6 @@ class Invariants:
         self._silent, self._turning, self._stopped_for = _Lasting(), _Lasting(), _Lasting()
         self._experimenting, self._sticking, self._ending = _Lasting(), _Lasting(), _Lasting()
         self._ended_run = ""  # the sequence that was ordered to end last
-        self.sequence_loops: dict[str, Collection[str]] = {}  # by run: those that have had a step
         self._lasting = (
             self._powerless,
             self._unneeded,
@@ -514,19 +513,16 @@ class Invariants:
         self._sequence_ends(supervisor, now_s)
 
     def _sequence_ends(self, supervisor: Supervisor, now_s: float) -> None:
-        """A sequence ends if somebody orders it to, or if a loop that has had a step is SAFE."""
-        status = supervisor.sequences.status() if self.sequence_loops else None
-        under_way = status is not None and status.state in {"running", "paused"}
-        run = status.run if status is not None and under_way else ""
-        had_steps = self.sequence_loops.get(run, ())
-        is_safe = any(supervisor.loops[name].mode is Mode.SAFE for name in had_steps)
-        for invariant, is_so in (
-            ("a sequence that is ordered to end does so", run != "" and run == self._ended_run),
-            ("a sequence ends if a loop that has had a step is SAFE", is_safe),
-        ):
-            lasted_s = self._ending.lasted_s(invariant, is_so=is_so, now_s=now_s)
-            if lasted_s > _SEQUENCE_ENDS_S:
-                self.violated(invariant, f"not in {lasted_s:.1f} s")
+        """A sequence that somebody orders to end does so."""
+        status = supervisor.sequences.status() if self._ended_run else None
+        goes_on = (
+            status is not None
+            and status.run == self._ended_run
+            and status.state in {"running", "paused"}
+        )
+        lasted_s = self._ending.lasted_s("", is_so=goes_on, now_s=now_s)
+        if lasted_s > _SEQUENCE_ENDS_S:
+            self.violated("a sequence that is ordered to end does so", f"not in {lasted_s:.1f} s")
 
     def _safe_in_time(self, name: str, mode: Mode, now_s: float) -> None:
         """A loop with a device that has been silent, or has reported a fault, for long is in SAFE or OFF."""

@@ -406,30 +406,12 @@ def test_only_what_was_admitted_may_be_passed_on_and_once():
 )
 def test_a_sequence_that_is_ordered_to_end_must(run, state, violated):
     watched = Rig()
-    watched.invariants.sequence_loops["first"] = ()
     sequences = watched.supervisor.sequences
     sequences.status = lambda: SimpleNamespace(run="first", state="running")
     watched.invariants.answered(SequenceControl(action="end"), Reply(accepted=True))
     assert watched.go_on(14.0) == []
 
     sequences.status = lambda: SimpleNamespace(run=run, state=state)
-    assert watched.go_on(3.0) == violated
-
-
-@pytest.mark.parametrize(
-    ("mode", "had_steps", "violated"),
-    [
-        (Mode.SAFE, {"right"}, ["a sequence ends if a loop that has had a step is SAFE"]),
-        (Mode.SAFE, set(), []),
-        (Mode.STANDBY, {"right"}, []),
-    ],
-)
-def test_a_sequence_ends_if_a_loop_that_has_had_a_step_is_safe(mode, had_steps, violated):
-    watched = Rig(mode=mode)
-    watched.supervisor.sequences.status = lambda: SimpleNamespace(run="first", state="running")
-    watched.invariants.sequence_loops["first"] = had_steps
-    assert watched.go_on(14.0) == []
-
     assert watched.go_on(3.0) == violated
 
 
