@@ -208,4 +208,5 @@ def _message(error: TyperException) -> str:
     text, _, possible = text.partition(" (Possible options: ")
     if possible:
         text += f"; did you mean {possible.rstrip(')').replace(', ', ' or ')}?"
-    return text.replace("\n", " ").replace("Input should be", "expected").rstrip(".")
+    text = text.replace("Input should be", "expected").replace("Value error, ", "")
+    return text.replace("\n", " ").rstrip(".")

@@ -103,7 +103,7 @@ def _plate(
     stem = f"fig{number:02d}-response-{name}"
     figure = new_figure(7.0, 6.4)
     panels = figure.subplots(3, 1, sharex=True, height_ratios=[2.0, 1.0, 1.0])
-    found.draw(panels, axis, truth[:, :, axis], "plant")
+    found.draw_axis(panels, axis, truth[:, :, axis], "plant")
     save(figure, folder, stem)
     caption = (
         f"Mirror driven in {_IN_WORDS[name]} by a chirp of ±7.2 arcsec from 0.1 Hz to 1 kHz, both axes "

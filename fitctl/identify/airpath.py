@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -115,10 +114,6 @@ class AirPathResult:
             for i, axis in enumerate(AXES)
         ]
         return lines
-
-    def plot(self, path: Path) -> None:
-        """Write :meth:`draw` to a file."""
-        self.draw().savefig(path)
 
     def draw(self) -> Figure:
         """Fig. 7: spectra of all spots and the joint fit."""

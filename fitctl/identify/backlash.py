@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +16,9 @@ from fitctl.identify.record import ExperimentRecord
 from fitctl.identify.whitening import whitener
 from fitctl.model.drives import SIDEROSTAT, Drive
 from fitctl.model.optics import scales
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
 AXES = ("az", "el")
@@ -134,7 +136,7 @@ class BacklashResult:
         )
         return lines
 
-    def plot(self, path: Path) -> None:
+    def draw(self) -> Figure:
         """The loop of each axis: what the camera saw, air path included, and the model."""
         figure = new_figure(10, 5)
         panels = figure.subplots(1, 2, sharex=True, sharey=True)
@@ -148,7 +150,7 @@ class BacklashResult:
             )
             panel.grid(alpha=0.3)
         panels[0].legend(markerscale=4)
-        figure.savefig(path)
+        return figure
 
 
 def analyse(rig: Rig, record: ExperimentRecord) -> BacklashResult:

@@ -8,8 +8,7 @@ separated. What is found is by how much the frames' time stamps are wrong, and w
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +21,9 @@ from fitctl.identify.record import ExperimentRecord
 from fitctl.identify.whitening import whitener
 from fitctl.model.drives import Drive
 from fitctl.model.optics import scales
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
 
@@ -93,7 +95,7 @@ class DelayResult:
             f"unexplained: {self.left:.1f} times the noise",
         ]
 
-    def plot(self, path: Path) -> None:
+    def draw(self) -> Figure:
         """How well each time shift explains the frames, and each tick's delay."""
         figure = new_figure(10.0, 4.2)
         left, right = figure.subplots(1, 2)
@@ -111,7 +113,7 @@ class DelayResult:
         for panel in (left, right):
             panel.grid(alpha=0.3)
         figure.suptitle(f"Loop delay of loop {self.loop}")
-        figure.savefig(path)
+        return figure
 
 
 def plan(rig: Rig, loop_name: str) -> list[Drive]:

@@ -31,7 +31,7 @@ Finding = (
     | beam.LinkDelayResult
     | ambient.AmbientResult
 )
-"""Each has `fragment`, to lay over the rig file, `lines`, for an operator, and `plot`, a PNG or SVG."""
+"""Each has `fragment`, to lay over the rig file, `lines`, for an operator, and `draw`, a figure."""
 
 
 class Identification(NamedTuple):

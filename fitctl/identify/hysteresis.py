@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +26,9 @@ from fitctl.identify.whitening import whitener
 from fitctl.model.drives import STACKS, Drive
 from fitctl.model.hysteresis import hysteresis_output, swept_loop_width, swept_stroke
 from fitctl.model.optics import mirror_from_stacks, scales
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
 SLOW_HZ, FAST_HZ = 0.5, 1.0
@@ -139,7 +141,7 @@ class HysteresisResult:
         )
         return lines
 
-    def plot(self, path: Path) -> None:
+    def draw(self) -> Figure:
         """Each stack's loops: what the camera saw, air path included, and the model."""
         figure = new_figure(12, 4.5)
         for stack, axes in enumerate(figure.subplots(1, 3, sharex=True, sharey=True)):
@@ -153,7 +155,7 @@ class HysteresisResult:
             axes.grid(alpha=0.3)
         figure.axes[0].set_ylabel("displacement, µm")
         figure.axes[0].legend(markerscale=5)
-        figure.savefig(path)
+        return figure
 
 
 def analyse(rig: Rig, record: ExperimentRecord) -> HysteresisResult:

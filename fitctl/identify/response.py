@@ -13,7 +13,7 @@ import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,9 @@ from fitctl.identify.modes_fit import ModesFit, fit_modes, modes_response
 from fitctl.logging.records import MOST
 from fitctl.mocks.detector import DetectorBench
 from fitctl.model.detector import DETECTOR_RANGE_V, SAMPLE_RATE_HZ, mirror_angles_seen
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -131,19 +134,19 @@ class ResponseResult:
             f"fit within {fit.misfit:.1%} RMS of the response",
         ]
 
-    def plot(self, path: Path) -> None:
+    def draw(self) -> Figure:
         """Figs. 5-6: magnitude, phase and coherence, excited and cross axis, with the fitted modes."""
         figure = new_figure(11.0, 7.5)
         panels = figure.subplots(3, len(self.fit.driven), sharex=True, sharey="row", squeeze=False)
         fitted = modes_response(self.fit, self.frequency_hz)
         for column, axis in enumerate(self.fit.driven):
-            self.draw(panels[:, column], column, fitted[:, :, column], "fit")
+            self.draw_axis(panels[:, column], column, fitted[:, :, column], "fit")
             panels[0, column].set_title(f"{AXES[axis]} driven, loop {self.loop}")
         for panel in panels[:, 1:].flat:
             panel.set_ylabel("")
-        figure.savefig(path)
+        return figure
 
-    def draw(self, panels: NDArray[Any], column: int, beside: Complexes, label: str) -> None:
+    def draw_axis(self, panels: NDArray[Any], column: int, beside: Complexes, label: str) -> None:
         """Gain, phase and coherence of one driven axis on three axes; dashed another response, (n, 2)."""
         gain, phase, coherence = panels
         hz, driven = self.frequency_hz, self.fit.driven[column]

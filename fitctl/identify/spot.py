@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -90,10 +89,6 @@ class SpotResult:
                 "designs assume. Look at the plot, at focus and at neighbours"
             )
         return lines
-
-    def plot(self, path: Path) -> None:
-        """Write :meth:`draw` to a file."""
-        self.draw().savefig(path)
 
     def draw(self) -> Figure:
         """Light of the pixels over their distance, and the Gaussian."""

@@ -173,6 +173,8 @@ def _place(origin: str, place: tuple[Any, ...]) -> tuple[str, type[Settings], st
     where = f"{origin}: step {place[1] + 1}"
     if len(place) == 2:
         return where, Sequence, ""
+    if place[3:4] == ("stars",) and len(place) > 5:
+        return f"{where} ({place[2]}): star {place[4] + 1}", Star, _key(place[5:])
     return f"{where} ({place[2]})", STEPS[place[2]], _key(place[3:])
 
 

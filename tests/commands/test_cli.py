@@ -110,6 +110,10 @@ BAD_INPUT = {
         ["discover", "--broadcast", "300.1.1.1"],
         "discover: --broadcast 300.1.1.1: expected an IPv4 address",
     ),
+    "a way to draw that there is not": (
+        ["console", "--graphics", "ascii"],
+        "(env var: 'FITCTL_GRAPHICS'): 'ascii' is not one of 'auto', 'half-blocks', 'sixel', 'kitty' (see",
+    ),
     "a rehearsal of what is no command": (["rehearse", "jog", "a", "1"], "rehearse: jog a 1: "),
     "a word that is no number": (["simulate", "--duration", "long"], "--duration"),
     "more runs than anybody waits for": (["simulate", "--runs", "9" * 20], "--runs"),

@@ -165,7 +165,7 @@ def test_the_operator_reads_values_with_intervals_and_sees_a_plot(result, tmp_pa
     text = "\n".join(result.lines())
     assert "64 s of frames, 2 spots" in text
     assert "95 %" in text
-    result.plot(tmp_path / "airpath.png")
+    result.draw().savefig(tmp_path / "airpath.png")
     assert (tmp_path / "airpath.png").stat().st_size > 1000
 
 

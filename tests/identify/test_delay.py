@@ -161,7 +161,7 @@ def test_a_lost_star_is_refused(rig, record):
 
 
 def test_the_plot_is_drawn(result, tmp_path):
-    result.plot(tmp_path / "delay.png")
+    result.draw().savefig(tmp_path / "delay.png")
     assert (tmp_path / "delay.png").stat().st_size > 1000
     assert any("ms" in line for line in result.lines())
 

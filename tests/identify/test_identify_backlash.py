@@ -132,5 +132,5 @@ def test_an_operator_reads_pixels_arcseconds_and_plate_scale(result):
 
 
 def test_a_plot_is_drawn(result, tmp_path):
-    result.plot(tmp_path / "loop.svg")
+    result.draw().savefig(tmp_path / "loop.svg")
     assert (tmp_path / "loop.svg").stat().st_size > 10_000

@@ -144,7 +144,7 @@ def test_an_operator_reads_stroke_and_width_of_every_stack(result):
 
 @pytest.mark.parametrize("suffix", ["png", "svg"])
 def test_a_plot_is_drawn(result, tmp_path, suffix):
-    result.plot(tmp_path / f"loops.{suffix}")
+    result.draw().savefig(tmp_path / f"loops.{suffix}")
     assert (tmp_path / f"loops.{suffix}").stat().st_size > 10_000
 
 

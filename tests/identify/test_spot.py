@@ -179,7 +179,7 @@ def test_on_the_instrument_it_finds_the_plants_spot(tmp_path):
     row = EXPERIMENTS["spot"]
     records = on_simulation(known, "right", "spot", row.plan(known, "right"), 1, lambda _part: None)
     found = row.from_records(known, "right", records)
-    found.plot(tmp_path / "spot.png")
+    found.draw().savefig(tmp_path / "spot.png")
 
     assert found.diameter_px == pytest.approx(3.0, abs=0.003)
     assert found.fragment() == {

@@ -1,5 +1,6 @@
 """The console on a terminal, while its process is stopped and continued."""
 
+import contextlib
 import os
 import pty
 import signal
@@ -17,11 +18,12 @@ import faulthandler
 import signal
 import sys
 from pathlib import Path
+from fitctl.commands.operate.console import _run
 from fitctl.messages.client import Client
 from fitctl.tui.app import ConsoleApp
 
 faulthandler.register(signal.SIGUSR1, file=open(sys.argv[2], "w"))
-ConsoleApp(Client(Path(sys.argv[1]))).run()
+_run(ConsoleApp(Client(Path(sys.argv[1]))))
 """
 CONTINUED_WHILE_IT_WRITES = """
 import queue
@@ -62,13 +64,21 @@ class OnTerminal:
             stdout=self.inside,
             stderr=self.inside,
             start_new_session=True,
-            env=env | {"TERM": "xterm-256color", "OPENBLAS_NUM_THREADS": "1"},
+            env=env
+            | {"TERM": "xterm-256color", "OPENBLAS_NUM_THREADS": "1", "TMPDIR": str(folder.parent)},
         )
         threading.Thread(target=self._read, daemon=True).start()
 
     def _read(self):
-        while True:
-            self.shown += os.read(self._terminal, 65536)
+        with contextlib.suppress(OSError):  # once it is closed
+            while True:
+                self.shown += os.read(self._terminal, 65536)
+
+    def close(self):
+        """Close the terminal, as its window does, or the network."""
+        os.close(self.inside)
+        os.close(self._terminal)
+        self.process.send_signal(signal.SIGHUP)
 
     def press(self, key):
         os.write(self._terminal, key)
@@ -129,6 +139,15 @@ def test_a_console_that_was_stopped_and_continued_ends_and_leaves_the_terminal_a
     console.press(b"q")
     assert console.process.wait(LIMIT_S) == 0
     assert termios.tcgetattr(console.inside) == console.modes_before
+
+
+@pytest.mark.long
+def test_a_console_whose_terminal_closes_ends_and_leaves_no_folder(console, tmp_path):
+    console.press(b"4")
+    until(lambda: list(tmp_path.glob("fitctl-console-*")), "the folder of edited sequences")
+    console.close()
+    assert console.process.wait(LIMIT_S) == 0
+    assert list(tmp_path.glob("fitctl-console-*")) == []
 
 
 @pytest.mark.long

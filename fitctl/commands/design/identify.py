@@ -7,7 +7,6 @@ import os
 import stat
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -34,7 +33,8 @@ from fitctl.logging.reading import logs_of_one_run_each
 from fitctl.messages.modes import Mode
 from fitctl.processes import ended_by_signals, interrupt
 
-_PLOT_SUFFIXES = (".png", ".svg")
+_PLOTS = {".png": "Software", ".svg": "Creator"}  # and which of its metadata says who wrote it
+_MOST_HEAD = 4096  # bytes before the end of a plot's metadata, at most
 _MOCK_VERNIER_S = 60.0
 _MOCK_SETTLE_S = 5.0
 _BENCH_ONLY = (
@@ -129,7 +129,8 @@ def identify(
                 settings, rig or default_rig_path(), overrides or [], what, loop, source, progress
             )
         # The plot first: it shows why, where there is nothing to write for the rig.
-        _write(plot_path, lambda: finding.plot(plot_path))
+        mark = {_PLOTS[plot_path.suffix]: f"Written by `{by}`"}
+        _write(plot_path, lambda: finding.draw().savefig(plot_path, metadata=mark))
         text = fragment_text(by, settings, finding.lines(), finding.fragment())
     except (IdentifyError, ConnectionError, demos.DemoError) as error:
         named = f"{log}: " if log else ""
@@ -149,24 +150,16 @@ def identify(
 def _plot_path(fragment: Path, wanted: Path | None, by: str) -> Path:
     """Where the plot goes; refuses, before minutes of an experiment, what could not be written after them."""
     _require_writable(fragment)
-    replaces = os.path.exists(fragment)
-    if replaces:
-        _require_own(fragment, by)
+    _require_own(fragment, by, "--out")
     plot = wanted or fragment.with_suffix(".png")
-    if plot.suffix not in _PLOT_SUFFIXES:
-        msg = f"identify: {plot}: plots are {' or '.join(_PLOT_SUFFIXES)}; name another with --plot"
+    if plot.suffix not in _PLOTS:
+        msg = f"identify: {plot}: plots are {' or '.join(_PLOTS)}; name another with --plot"
         raise ConfigError(msg)
     if plot.resolve() == fragment.resolve():
         msg = f"identify: {plot}: is both the fragment and the plot; name another with --out or --plot"
         raise ConfigError(msg)
     _require_writable(plot)
-    is_beside = plot == fragment.with_suffix(plot.suffix)
-    if os.path.exists(plot) and not (replaces and is_beside):
-        msg = (
-            f"identify: {plot}: exists already, and not beside a fragment of {by}; name another file with "
-            "--plot, or move that one away"
-        )
-        raise ConfigError(msg)
+    _require_own(plot, by, "--plot")
     return plot
 
 
@@ -182,18 +175,24 @@ def _require_writable(path: Path) -> None:
         raise ConfigError(msg)
 
 
-def _require_own(path: Path, by: str) -> None:
-    """Refuse a file that another command wrote; a simulated run does not replace a measured fragment either."""
-    head = ""
-    with suppress(OSError), path.open("rb") as file:
-        head = file.readline(200).decode(errors="replace")
-    if head.startswith(f"# Written by `{by}"):  # a measured run also replaces `... --simulate`
+def _require_own(path: Path, by: str, option: str) -> None:
+    """Refuse a file that another command wrote; a simulated run does not replace what was measured either."""
+    try:
+        with path.open("rb") as file:
+            head = file.readline(200) if option == "--out" else file.read(_MOST_HEAD)
+        is_own = (
+            f"Written by `{by}".encode() in head
+        )  # a measured run also replaces `... --simulate`
+    except FileNotFoundError:
         return
-    msg = (
-        f"identify: {path}: exists already, and was not written by {by}; name another file with --out, or "
-        "move that one away"
-    )
-    raise ConfigError(msg)
+    except OSError:
+        is_own = False
+    if not is_own:
+        msg = (
+            f"identify: {path}: exists already, and was not written by {by}; name another file with "
+            f"{option}, or move that one away"
+        )
+        raise ConfigError(msg)
 
 
 def _write(path: Path, write: Callable[[], object]) -> None:

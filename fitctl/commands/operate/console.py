@@ -147,7 +147,8 @@ def _show_log(log: Path, remote: Path | None, graphics: str, *, web: bool) -> No
 
 
 def _run(app: ConsoleApp, niceness: int = _NICENESS) -> None:
-    signal.signal(signal.SIGTERM, lambda *_: app.exit())  # leaves the terminal as it was
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, lambda *_: app.exit())  # leaves the terminal as it was, and no folder
     # Whatever points the star goes first. What the console starts gives way as well: a sequence, too, only
     # asks the supervisor for what that then does in its own time.
     give_way(niceness)

@@ -90,6 +90,9 @@ def commission(
     fitctl records finished steps beside the rig file, and continues there next time. No supervisor may run.
     Exit status 1 if a step fails or is not done.
     """
+    if list_steps and (skipped or compare):
+        msg = "commission: --list only lists the steps; leave out --skip and --compare"
+        raise ConfigError(msg)
     path = named_rig(rig) or default_rig_path()
     settings = load_rig(path, overrides or ())
     where = _folder(path, folder, reads_only=list_steps)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +14,9 @@ from fitctl.controllers.photodiodes import ambient_of
 from fitctl.identify.drawing import new_figure
 from fitctl.identify.errors import IdentifyError
 from fitctl.logging.reading import Columns
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
 STEP = "ambient"
@@ -74,7 +76,7 @@ class AmbientResult:
             f"{len(self.volts)} samples",
         ]
 
-    def plot(self, path: Path) -> None:
+    def draw(self) -> Figure:
         """The samples over time."""
         figure = new_figure(9.0, 4.5)
         panel = figure.subplots()
@@ -87,7 +89,7 @@ class AmbientResult:
         )
         panel.grid(alpha=0.3)
         panel.legend()
-        figure.savefig(path)
+        return figure
 
 
 def analyse(rig: Rig, loop_name: str, ticks: Columns) -> AmbientResult:

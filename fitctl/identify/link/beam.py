@@ -9,8 +9,7 @@ beam is moved at two speeds.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +27,9 @@ from fitctl.logging.reading import Columns
 from fitctl.logging.records import MOST
 from fitctl.model.metrology.photodiodes import diode_volts
 from fitctl.model.optics import rotation
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
 STEP = "beam_scan"
@@ -113,7 +115,7 @@ class BeamResult:
             f"times noise_v, {len(self.volts)} samples",
         ]
 
-    def plot(self, path: Path) -> None:
+    def draw(self) -> Figure:
         """Each photodiode's volts, and what is left of them, against the beam's place along its own axis."""
         figure = new_figure(10.0, 7.0)
         panels = figure.subplots(2, 2, sharex="col")
@@ -131,7 +133,7 @@ class BeamResult:
             panel.grid(alpha=0.3)
             panel.legend(markerscale=4)
         figure.suptitle(f"Photodiodes of loop {self.loop}")
-        figure.savefig(path)
+        return figure
 
 
 class PhotodiodesResult(BeamResult):

@@ -8,8 +8,7 @@ motion, is together what the link's siderostat did to the star.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +22,9 @@ from fitctl.identify.whitening import whitener
 from fitctl.logging.reading import Columns
 from fitctl.model.hysteresis import displacement_series
 from fitctl.model.optics import mirror_from_stacks, scales
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Floats = NDArray[np.float64]
 AXES = ("az", "el")
@@ -109,7 +111,7 @@ class FeedforwardResult:
             f"frames, {self.left_out:.1%} of them left out as outliers; {self.late:.1%} of the ticks were late",
         ]
 
-    def plot(self, path: Path) -> None:
+    def draw(self) -> Figure:
         """What the own stages undid against the link's beam, and what is left."""
         figure = new_figure(10.0, 7.0)
         panels = figure.subplots(2, 2, sharex="col")
@@ -124,7 +126,7 @@ class FeedforwardResult:
         for panel in panels.flat:
             panel.grid(alpha=0.3)
         figure.suptitle(f"Feedforward of loop {self.loop}")
-        figure.savefig(path)
+        return figure
 
 
 def analyse(rig: Rig, loop_name: str, ticks: Columns) -> FeedforwardResult:

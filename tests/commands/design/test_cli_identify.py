@@ -12,6 +12,7 @@ from fitctl.cli import main
 from fitctl.commands.design import identify as commands
 from fitctl.daemon.run import run_info
 from fitctl.identify import run as runs
+from fitctl.identify.drawing import new_figure
 from fitctl.identify.errors import IdentifyError
 from fitctl.identify.experiments import EXPERIMENTS
 from fitctl.identify.run import on_simulation
@@ -221,10 +222,25 @@ def begun(monkeypatch):
     monkeypatch.setattr(commands, "on_simulation", end)
 
 
+def plots_of(monkeypatch):
+    """An experiment with a plot but no values, as a response with three modes."""
+
+    class Finding:
+        def draw(self):
+            return new_figure()
+
+        def lines(self):
+            return []
+
+        def fragment(self):
+            msg = "no values"
+            raise IdentifyError(msg)
+
+    monkeypatch.setattr(commands, "_finding", lambda *_: Finding())
+
+
 @pytest.mark.parametrize("words", [[], ["--plot", "other.svg"]])
-def test_a_plot_that_is_not_beside_an_own_fragment_is_not_replaced(
-    identify, begun, tmp_path, words
-):
+def test_a_plot_of_something_else_is_not_replaced(identify, begun, tmp_path, words):
     for name in ("camera.png", "other.svg"):
         (tmp_path / name).write_text("mine")
 
@@ -235,16 +251,19 @@ def test_a_plot_that_is_not_beside_an_own_fragment_is_not_replaced(
     assert len(err.splitlines()) == 1
 
 
-def test_an_experiment_replaces_its_own_two_files(identify, begun, tmp_path):
-    (tmp_path / "camera.toml").write_text("# Written by `fitctl identify delay --simulate` for rig")
-    for name in ("camera.png", "camera.svg", "other.png"):
-        (tmp_path / name).touch()
+@pytest.mark.parametrize("plot", ["a.png", "a.svg"])
+def test_an_experiment_replaces_its_own_plot_and_no_measured_one(
+    identify, monkeypatch, tmp_path, plot
+):
+    plots_of(monkeypatch)
+    by = ("delay", "--simulate", "--plot", plot)
+    assert [identify(*by)[0], identify(*by)[0]] == [1, 1]
+    (tmp_path / plot).write_bytes((tmp_path / plot).read_bytes().replace(b" --simulate`", b"`"))
 
-    by = ("delay", "--simulate", "--out", "camera.toml")
-    assert [
-        identify(*by, *words)[0]
-        for words in ([], ["--plot", "camera.svg"], ["--plot", "other.png"])
-    ] == [1, 1, 2]
+    status, err = identify(*by)
+
+    assert status == 2
+    assert "exists already, and was not written by fitctl identify delay --simulate" in err
 
 
 @pytest.mark.parametrize("option", ["--out", "--plot"])

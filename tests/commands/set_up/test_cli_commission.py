@@ -65,6 +65,13 @@ def test_the_list_has_every_step_and_what_it_moves(commission, tmp_path):
     assert "each motor by 0.03 rad and back" in text
 
 
+@pytest.mark.parametrize("words", [("--skip", "one=by hand"), ("--compare", "other.json")])
+def test_the_list_refuses_options_of_a_run(commission, words):
+    status, text = commission("--list", *words)
+    assert status == 2
+    assert "--list only lists the steps; leave out --skip and --compare" in text
+
+
 def test_the_list_for_programs_has_what_each_step_needs_and_what_came_of_it(commission, two_steps):
     commission("--yes", "--until", "one")
     status, text = commission("--list", "--json")

@@ -46,7 +46,7 @@ def test_a_light_that_changes_slowly_makes_the_interval_wider():
 
 
 def test_it_is_plotted(tmp_path):
-    ambient.analyse(RIG, "metrology", samples(1)).plot(tmp_path / "ambient.svg")
+    ambient.analyse(RIG, "metrology", samples(1)).draw().savefig(tmp_path / "ambient.svg")
     assert (tmp_path / "ambient.svg").stat().st_size > 10_000
 
 

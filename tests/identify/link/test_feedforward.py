@@ -172,7 +172,7 @@ def test_an_axis_that_takes_up_its_play_while_it_rests_does_not_count_as_swingin
 @pytest.mark.long
 def test_it_is_plotted(tmp_path):
     found = feedforward.analyse(RIG, "left", scan(1))
-    found.plot(tmp_path / "feedforward.png")
+    found.draw().savefig(tmp_path / "feedforward.png")
     assert (tmp_path / "feedforward.png").stat().st_size > 10_000
 
 

@@ -224,8 +224,10 @@ HEAD = 'schema_version = 1\nname = "a"\ndescription = "b"\n[[steps]]\nstep = "st
         ("stars = [{name='f', az_sky_arcsec=0, el_sky_arcsec=0, star_flux_dn=20}]",
          "star f: a star of 20 DN could not be distinguished from noise"),
         ("stars = [{name='f', az_sky_arcsec=0, el_sky_arcsec=0, star_flux_dn=-1}]",
-         "stars.0.star_flux_dn: must be greater than 0"),
-        ("stars = [{name='b', az_sky_arcsec=1}]", "stars.0.el_sky_arcsec: is missing"),
+         "step 1 (stars): star 1: star_flux_dn: must be greater than 0"),
+        ("stars = [A, {name='b', az_sky_arcsec=1}]", "step 1 (stars): star 2: el_sky_arcsec: is missing"),
+        ("stars = [{name='b', az_sky_arcsec=1, el_sky_arcsec=1, duratoin_s=1}]",
+         "star 1: duratoin_s: unknown key; did you mean duration_s? (allowed here: name, az_sky_arcsec,"),
     ],
 )  # fmt: skip
 def test_a_list_that_cannot_be_gone_through_is_refused_before_anything_moves(tmp_path, keys, said):
