@@ -131,6 +131,13 @@ ROWS = {row.make: row for row in COMMANDS}
 RENAMED = {"hold": "release"}
 """Words of an older fitctl, which are refused with the word of today."""
 WORDS = {row.word: row for row in COMMANDS if row.word}
+_OF_THE_RIG = frozenset(
+    {
+        *(commands.Status, commands.RecentEvents, commands.TakeOver, commands.Shutdown),
+        *(commands.MoveCollector, commands.FrameRate),
+    }
+)
+"""These are for no single loop."""
 
 
 def command_of(word: str, values: Sequence[str], loop: str, caller: str = "send") -> AnyCommand:
@@ -149,6 +156,9 @@ def command_of(word: str, values: Sequence[str], loop: str, caller: str = "send"
         msg = f"{caller}: unknown command {shown!r}. Available: {', '.join(WORDS)}"
         raise ConfigError(msg)
     row = WORDS[word]
+    if loop and row.make in _OF_THE_RIG:
+        msg = f"{caller}: {word} is for the whole rig; expected no loop, got {loop}"
+        raise ConfigError(msg)
     named = [text for text in values if "=" in text and text.partition("=")[0] in row.options]
     plain = [text for text in values if text not in named]
     if len(plain) != len(row.values):

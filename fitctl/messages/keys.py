@@ -30,7 +30,8 @@ KeyText = Annotated[str, msgspec.Meta(pattern=r"^[!-~]{40}\Z")]  # Z85, 32 bytes
 Name = Annotated[str, msgspec.Meta(pattern=r"^[a-z0-9][a-z0-9_-]{0,31}\Z")]
 PortNumber = Annotated[int, msgspec.Meta(ge=1, le=65535)]
 _AS_OWNER = "run this as the user whose folder it is"
-_HOST = r"^[A-Za-z0-9:][A-Za-z0-9._:%-]*\Z"  # what libzmq connects to
+# What libzmq connects to: a name or an IPv4 address, or an IPv6 address with two colons at least; no port.
+_HOST = r"^([A-Za-z0-9][A-Za-z0-9._-]{0,252}|[0-9A-Fa-f.]*:[0-9A-Fa-f.]*:[0-9A-Fa-f.:]*(%[A-Za-z0-9._-]+)?)\Z"
 
 
 class _Keys(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -63,7 +64,7 @@ class AllowedKey(_Keys, frozen=True, kw_only=True, forbid_unknown_fields=True):
 class RemoteKey(_Keys, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """All that a client needs to reach one rig."""
 
-    rig: str
+    rig: Annotated[str, msgspec.Meta(pattern=r"^[^\x00-\x1f\x7f-\x9f\u2028\u2029]{1,100}\Z")]
     name: Name
     role: Role
     host: Annotated[str, msgspec.Meta(pattern=_HOST)]
@@ -136,7 +137,7 @@ def new_key(rig: Rig, name: str, role: Role, host: str, out: Path) -> RemoteKey:
     if not re.match(_HOST, host) or _is_unspecified(host):
         msg = (
             f"keys: a client cannot reach this machine at {host!r}; give its name or address with --host, "
-            "or set service.tcp_address to one"
+            "without a port, or set service.tcp_address to one"
         )
         raise ConfigError(msg)
     pair = _new_pair()
@@ -314,9 +315,12 @@ def _read(path: Path, kind: type[T]) -> T:
             mode = stat.S_IMODE(os.fstat(file.fileno()).st_mode)
             text = file.read(65536)
         if mode & 0o077:
+            leaked = (
+                "delete it and make all keys again" if kind is KeyPair else "revoke it"
+            )  # the server's own pair cannot be revoked
             msg = (
-                f"{path}: other users can read it (mode {mode:04o}); revoke it if another user "
-                "may have read it, then: chmod 600"
+                f"{path}: other users can read it (mode {mode:04o}); if another user may have read it, "
+                f"{leaked}; otherwise: chmod 600"
             )
             raise ConfigError(msg)
         return msgspec.toml.decode(text, type=kind)

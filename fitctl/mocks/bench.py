@@ -6,6 +6,7 @@ ZeroMQ REP on 127.0.0.1, msgpack. Known limitation: history is as long as ``plan
 from __future__ import annotations
 
 import asyncio
+import struct
 from collections.abc import Mapping, Sequence
 from typing import TypeVar
 
@@ -17,7 +18,7 @@ from pydantic import ValidationError
 
 from fitctl.config import ARCSEC_PER_RAD, Fault, Fringes
 from fitctl.config.base import must_be
-from fitctl.mocks.faults import Faults, UnknownFault, check_fault
+from fitctl.mocks.faults import Faults, UnknownFault, check_fault, known_kind
 from fitctl.model.metrology.fringes import mean_visibility
 from fitctl.model.plant import Plant
 from fitctl.model.stellar_part import StellarPart
@@ -192,11 +193,16 @@ class FaultTable:
             elif isinstance(question, ClearFaults):
                 names = [question.device] if question.device else list(self._devices)
                 for name in names:
-                    self._of(name).clear(question.kind, question.part)
+                    faults = self._of(name)
+                    if question.device and question.kind:
+                        known_kind(name, question.kind, question.part, faults.kinds)
+                    faults.clear(question.kind, question.part)
         except UnknownFault as error:
             return FaultsNow([], str(error))
         except ValidationError as error:
             return FaultsNow([], _wrong(error))
+        except (ArithmeticError, ValueError, struct.error) as error:
+            return FaultsNow([], f"the mock device cannot have this value: {error}")
         active = [fault for faults in self._devices.values() for fault in faults.active]
         return FaultsNow([ActiveFault(**fault.model_dump(exclude={"at_s"})) for fault in active])
 

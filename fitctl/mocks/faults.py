@@ -26,24 +26,31 @@ class FaultKind(NamedTuple):
         Where the fault gives none.
     parts : tuple of str
         What of the device it can be limited to; without any it is the whole device.
+    least, most : float
+        What its value may be.
     """
 
     text: str
     unit: str = ""
     value: float = math.nan
     parts: tuple[str, ...] = ()
+    least: float = -math.inf
+    most: float = math.inf
 
 
 WIRE_FAULTS = {
     "drop": FaultKind("what the device sends is lost"),
-    "delay": FaultKind("what the device sends arrives later", "s", 0.1),
+    "delay": FaultKind("what the device sends arrives later", "s", 0.1, least=0.0),
     "corrupt": FaultKind("one bit of what the device sends is flipped"),
     "duplicate": FaultKind("what the device sends arrives twice"),
     "reorder": FaultKind("what the device sends arrives after its next message"),
     "disconnect": FaultKind("connections are cut and none is accepted"),
     "freeze": FaultKind("connections stay open, but the device reads and sends nothing"),
     "reboot": FaultKind(
-        "power is cycled: the device is off for this long, then as at power-up", "s", 2.0
+        "power is cycled: the device is off for this long, then as at power-up",
+        "s",
+        2.0,
+        least=0.0,
     ),
 }
 """Every device has these; each takes effect message by message with the fault's probability."""
@@ -224,23 +231,41 @@ class Wire:
         self._timers.add(timer)
 
 
+def known_kind(device: str, name: str, part: str, kinds: Mapping[str, FaultKind]) -> FaultKind:
+    """The kind of that name.
+
+    Raises
+    ------
+    UnknownFault
+        If the device has no such kind, or that no such part.
+    """
+    kind = kinds.get(name)
+    if kind is None:
+        msg = f"{device} has no fault {name}; it has {', '.join(kinds)}"
+        raise UnknownFault(msg)
+    if part and part not in kind.parts:
+        having = f"it has {', '.join(kind.parts)}" if kind.parts else "it is of the whole device"
+        msg = f"{device}: fault {name} has no part {part}; {having}"
+        raise UnknownFault(msg)
+    return kind
+
+
 def check_fault(fault: Fault, kinds: Mapping[str, FaultKind]) -> FaultKind:
     """The kind of a fault.
 
     Raises
     ------
     UnknownFault
-        If there is no such kind or part, or the fault takes no value.
+        If there is no such kind or part, or the fault takes no value, or not this one.
     """
-    kind = kinds.get(fault.kind)
-    if kind is None:
-        msg = f"{fault.device} has no fault {fault.kind}; it has {', '.join(kinds)}"
-        raise UnknownFault(msg)
-    if fault.part and fault.part not in kind.parts:
-        having = f"it has {', '.join(kind.parts)}" if kind.parts else "it is of the whole device"
-        msg = f"{fault.device}: fault {fault.kind} has no part {fault.part}; {having}"
-        raise UnknownFault(msg)
+    kind = known_kind(fault.device, fault.kind, fault.part, kinds)
     if fault.value is not None and not kind.unit:
         msg = f"{fault.device}: fault {fault.kind} takes no value"
+        raise UnknownFault(msg)
+    if fault.value is not None and not kind.least <= fault.value <= kind.most:
+        msg = (
+            f"{fault.device}: fault {fault.kind} {fault.value:g}: expected {kind.least:g} to {kind.most:g} "
+            f"({kind.unit})"
+        )
         raise UnknownFault(msg)
     return kind

@@ -78,8 +78,12 @@ BAD_INPUT = {
     "a negative duration": (["simulate", "--duration", "-3"], "duration"),
     "a negative seed": (["simulate", "--seed", "-1"], "seed"),
     "a loop that is none": (
-        ["send", "stop", "--loop", "left", "--rig", str(default_rig_path())],
+        ["send", "off", "--loop", "left", "--rig", str(default_rig_path())],
         "has right",
+    ),
+    "a loop for a command of the rig": (
+        ["send", "shutdown", "--loop", "right"],
+        "send: shutdown is for the whole rig; expected no loop, got right",
     ),
     "a log folder that is none": (["run", "--set", "logging.folder=/dev/null/x"], "logging.folder"),
     "a servo that would swing": (

@@ -109,6 +109,9 @@ def test_a_name_that_looks_like_an_address_is_a_name(rig, tmp_path, host):
     ("before", "after"),
     [
         ('host = "127.0.0.1"', 'host = "ho st"'),
+        ('host = "127.0.0.1"', 'host = "127.0.0.1:7420"'),
+        ('host = "127.0.0.1"', f'host = "{"a" * 300}"'),
+        ('rig = "fit-mock"', 'rig = "x\\nfit-mock: well"'),
         ('host = "127.0.0.1"', 'host = "127.0.0.1\\n"'),
         ("server_public", f'server_public = "{40 * "#"}"'),
         ("secret", f'secret = "{40 * "~"}"'),
@@ -132,7 +135,10 @@ def test_a_folder_of_keys_that_cannot_be_is_refused(rig, folder):
         keys_folder(rig.model_copy(update={"service": service}))
 
 
-@pytest.mark.parametrize("host", ["0.0.0.0", "::", "ho st", "-x", "a/b", "a\n"])
+@pytest.mark.parametrize(
+    "host",
+    ["0.0.0.0", "::", "ho st", "-x", "a/b", "a\n", ":", "10.0.0.5:6000", "rig.example.org:6000"],
+)
 def test_an_address_that_is_none_is_no_place_to_reach(rig, tmp_path, host):
     with pytest.raises(ConfigError, match="--host"):
         new_key(rig, "anna", "commander", host, tmp_path / "key.toml")

@@ -196,7 +196,7 @@ def test_the_bench_knows_beam_and_visibility_and_where_it_does_not_says_why(runn
 
 
 def test_doctor_asks_the_labjack_who_it_is(running, capsys):
-    ask_devices(running.rig, as_json=True)
+    ask_devices(running.rig, RIG_FILE, as_json=True)
     found = {one["device"]: one for one in json.loads(capsys.readouterr().out)["devices"]}
     photodiodes = found["metrology photodiodes"]
     assert photodiodes["disagreements"] == []

@@ -12,7 +12,7 @@ from fitctl.commands.shared.options import JsonOption, RemoteOption, RigOption, 
 from fitctl.commands.shared.present import present_of_rig
 from fitctl.commands.shared.printing import say, to_json
 from fitctl.commands.shared.rig import rig_of
-from fitctl.commands.shared.supervisor import address
+from fitctl.commands.shared.supervisor import address, show_rig
 from fitctl.messages.command_table import command_of
 from fitctl.processes import ended_by_signals, interrupt
 
@@ -61,6 +61,7 @@ def rehearse(
         rig, overrides = found.file, found.settings
     settings = rig_of(rig, overrides)
     settings.mock_parts()
+    show_rig(settings.name, str(rig or remote))
     state = present_of_rig(settings, remote, "rehearse")
     try:
         with ended_by_signals(interrupt):

@@ -104,10 +104,10 @@ def _rows(telemetry: Telemetry) -> Iterator[tuple[str, str]]:
         text = f"{device.state}{known} at {device.endpoint}, {device.detail}"
         yield device.device, text
     for timing in telemetry.timing:
-        text = (
-            f"{timing.ticks} ticks, {timing.late_ticks} late, computed in "
-            f"{timing.compute_worst_s * 1e3:.1f} ms at worst, {timing.stalls} stalls of the machine"
-        )
+        text = f"{timing.ticks} ticks, {timing.late_ticks} late"
+        if not math.isnan(timing.compute_worst_s):  # of no tick
+            text += f", computed in {timing.compute_worst_s * 1e3:.1f} ms at worst"
+        text += f", {timing.stalls} stalls of the machine"
         yield f"{timing.loop} last second", text
     if telemetry.recorder is not None:
         text = f"{telemetry.recorder.path}, {telemetry.recorder.records} records"
@@ -133,6 +133,8 @@ def _beam(telemetry: Telemetry, loop_name: str) -> str:
 
 def duration(seconds: float) -> str:
     """A time span for people: its two largest units."""
+    if not math.isfinite(seconds):
+        return "an unknown time"
     whole = int(max(0.0, seconds))
     parts = [
         (whole // 86400, "d"),

@@ -83,7 +83,8 @@ def _guard(web, address: str, key: str) -> _Handler:  # pyrefly: ignore[implicit
 
     async def guard(request, handler):  # pyrefly: ignore[implicit-any-parameter, unannotated-return]  # aiohttp's
         at_home = request.host == host and request.headers.get("Origin", address) == address
-        given = request.path.split("/")[1]  # of any characters, which strings are not compared with
+        # Of any characters, which strings are not compared with; a path may be "*".
+        given = request.path.partition("/")[2].partition("/")[0]
         if at_home and secrets.compare_digest(given.encode(errors="replace"), key.encode()):
             response = await handler(request)
             if isinstance(response, web.Response) and response.content_type == "text/html":

@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 import shutil
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import typer
@@ -19,12 +20,13 @@ from fitctl.commands.shared.exits import FAILED
 from fitctl.commands.shared.options import JsonOption, OwnRigOption, SetOption
 from fitctl.commands.shared.printing import say, to_json
 from fitctl.commands.shared.rig import named_rig, rig_of
-from fitctl.commands.shared.supervisor import client_of
 from fitctl.commissioning.asking import Finding, examine_all, parts_of, without_mocks
-from fitctl.config import Rig
+from fitctl.config import Rig, default_rig_path
 from fitctl.config.simulated import mixture
 from fitctl.drivers.interface import DeviceIdentity
+from fitctl.messages.client import Client
 from fitctl.messages.endpoints import COMMAND_SOCKET, service_folder
+from fitctl.messages.running import running_rigs, supervisor_runs
 from fitctl.messages.telemetry import Telemetry
 from fitctl.text import plain
 
@@ -41,13 +43,14 @@ def doctor(
     reports about its devices instead. Exit status 1 if a device is missing or differs from the rig file.
     Mocks that do not run are not counted.
     """
-    raise typer.Exit(ask_devices(rig_of(named_rig(rig), overrides), as_json=as_json))
+    path = named_rig(rig) or default_rig_path()
+    raise typer.Exit(ask_devices(rig_of(path, overrides), path, overrides or [], as_json=as_json))
 
 
-def ask_devices(rig: Rig, *, as_json: bool) -> int:
+def ask_devices(rig: Rig, path: Path, overrides: Sequence[str] = (), *, as_json: bool) -> int:
     """Ask every device of a rig, print what they answer; returns the exit status."""
     logging.disable()  # libraries print on stderr what is in the table
-    running = _running_supervisor(rig)
+    running = _running_supervisor(rig, path, overrides)
     findings = without_mocks(rig, examine_all(rig)) if running is None else reported(rig, running)
     asked = "devices" if running is None else "supervisor"
     if as_json:
@@ -85,22 +88,43 @@ def reported(rig: Rig, running: Telemetry) -> list[Finding]:
     return findings
 
 
-def _running_supervisor(rig: Rig) -> Telemetry | None:
-    """A message of the rig's supervisor on this machine, if one answers.
+def _devices_settings(overrides: Sequence[str]) -> set[str]:
+    """Without those that do not change where the devices are."""
+    return {text for text in overrides if not text.startswith("service.")}
 
-    One that has just started reports its devices within a second or two.
+
+def _running_supervisor(rig: Rig, path: Path, overrides: Sequence[str]) -> Telemetry | None:
+    """A message of the rig's supervisor on this machine, if one runs, in whatever folder.
+
+    One that has just started reports its devices within a second or two. If one runs and does not answer,
+    doctor ends: nobody else may query its devices.
     """
-    if not (service_folder(rig) / COMMAND_SOCKET).exists():
+    here, wanted = service_folder(rig), (str(path.absolute()), _devices_settings(overrides))
+    runs = [
+        Path(one.folder)
+        for one in running_rigs()
+        if (one.file, _devices_settings(one.settings)) == wanted
+    ]
+    if supervisor_runs(here):
+        runs.insert(0, here)
+    elif not runs and not (here / COMMAND_SOCKET).exists():
         return None
-    client = client_of(rig)
+    client = Client((runs or [here])[0])
     try:
         running = newest_telemetry(client)
         deadline_s = time.monotonic() + _FIRST_REPORT_S
         while not running.devices and time.monotonic() < deadline_s:
             running = client.receive(_FIRST_REPORT_S) or running
         return running
-    except ConnectionError:
-        return None
+    except ConnectionError as error:
+        if not runs:
+            return None  # what ended left its socket
+        say(
+            f"doctor: a supervisor of {rig.name} runs with its sockets in {runs[0]}, but {error}. The devices "
+            "were not queried, because that would disturb it",
+            err=True,
+        )
+        raise typer.Exit(FAILED) from None
     finally:
         client.close()
 

@@ -123,7 +123,7 @@ def init(
     status = 0
     all_mocks = len(simulated) == len(devices)
     if ask_devices and not all_mocks:
-        status = run_doctor(rig, as_json=False)
+        status = run_doctor(rig, file, as_json=False)
     else:
         for line in mixture_warnings(rig):
             say(line)

@@ -54,6 +54,14 @@ def progress_line(text: str, total: float = 1.0) -> Iterator[ShowProgress]:
 
 
 def utc(telemetry: Telemetry, time_s: float) -> str:
-    """A time of the supervisor's clock as ISO 8601."""
-    wall_s = time_s + telemetry.wall_minus_monotonic_s
-    return datetime.fromtimestamp(wall_s, UTC).isoformat(timespec="milliseconds")
+    """A time of the supervisor's clock as ISO 8601; empty for one that a clock cannot have."""
+    stamp = datetime_of(time_s + telemetry.wall_minus_monotonic_s)
+    return "" if stamp is None else stamp.isoformat(timespec="milliseconds")
+
+
+def datetime_of(wall_s: float) -> datetime | None:
+    """A time; None for one that no clock can have: a remote program may send any number."""
+    try:
+        return datetime.fromtimestamp(wall_s, UTC)
+    except (ValueError, OverflowError, OSError):
+        return None

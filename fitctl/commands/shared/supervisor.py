@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from concurrent.futures import ThreadPoolExecutor
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,7 +11,7 @@ import typer
 from msgspec.structs import asdict
 
 from fitctl.commands.shared.exits import FAILED, INTERRUPTED, NO_SUPERVISOR, STILL_UNDER_WAY
-from fitctl.commands.shared.printing import say, to_json
+from fitctl.commands.shared.printing import datetime_of, say, to_json
 from fitctl.commands.shared.rig import named_rig, rig_of
 from fitctl.config import ConfigError, Rig, default_rig_path
 from fitctl.messages.client import Client
@@ -251,8 +250,9 @@ def print_reply(reply: Reply | ConnectionError, sender: str, *, as_json: bool) -
         return 0 if reply.accepted else FAILED
     wall_minus_monotonic_s = time.time() - reply.time_s
     for event in reply.events:
-        stamp = datetime.fromtimestamp(event.time_s + wall_minus_monotonic_s, UTC)
-        say(f"{stamp:%Y-%m-%d %H:%M:%S}  {event.severity}: {event.source}: {event.message}")
+        stamp = datetime_of(event.time_s + wall_minus_monotonic_s)
+        when = "at no time" if stamp is None else f"{stamp:%Y-%m-%d %H:%M:%S}"
+        say(f"{when}  {event.severity}: {event.source}: {event.message}")
     text = reply.text or ("accepted" if reply.accepted else "refused")
     say(text, err=not reply.accepted)
     return 0 if reply.accepted else FAILED

@@ -9,6 +9,7 @@ import msgspec
 import typer
 
 from fitctl.commands.shared import completion
+from fitctl.commands.shared.exits import FAILED
 from fitctl.commands.shared.fault_kinds import kinds
 from fitctl.commands.shared.options import JsonOption, RigOption, SetOption
 from fitctl.commands.shared.printing import say, to_json
@@ -143,8 +144,11 @@ def _change(
     try:
         now = ask_bench(port, msgspec.structs.replace(question, rig=rig.name), FaultsNow)
     except ConnectionError as error:
-        msg = f"fault: {error}; start fitctl mocks, or give its port: --set mocks.bench_port=PORT"
-        raise ConfigError(msg) from None
+        say(
+            f"fault: {error}; start fitctl mocks, or give its port: --set mocks.bench_port=PORT",
+            err=True,
+        )
+        raise typer.Exit(FAILED) from None
     if now.rig != rig.name:
         msg = (
             f"fault: nothing was changed: at 127.0.0.1:{port} are the mocks of rig {now.rig}, and {found.file} "

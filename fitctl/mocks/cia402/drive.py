@@ -36,7 +36,7 @@ FAULTS = (
     | {
         "link_loss": FaultKind("the CAN cable between adapter and drive is cut"),
         "amplifier_fault": AXIS_FAULTS["amplifier_fault"]._replace(
-            unit="error code of CiA 402", value=protocol.ERROR_OVER_CURRENT
+            unit="error code of CiA 402", value=protocol.ERROR_OVER_CURRENT, least=0, most=0xFFFF
         ),
         "following_error": FaultKind(
             "the drive finds that a motor does not follow: fault 0x8611", parts=AXES

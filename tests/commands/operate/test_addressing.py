@@ -1,5 +1,6 @@
 """Which rig a command reaches: never one that nobody named while another runs."""
 
+import json
 import os
 import time
 from contextlib import ExitStack
@@ -10,6 +11,7 @@ from instruments.served import Served, free_port, rig_in
 from fitctl import Instrument
 from fitctl.cli import main
 from fitctl.commands.try_out import fault
+from fitctl.commissioning.asking import PROBES
 from fitctl.config import ConfigError, default_rig_path
 from fitctl.messages import endpoints, running
 from fitctl.messages.endpoints import make_service_folder, supervisor_name
@@ -286,3 +288,43 @@ def test_the_environment_names_the_rig_of_an_instrument(night, monkeypatch, tmp_
         Instrument()
     with Instrument(simulate=True) as instrument:
         assert instrument.rig.name == "mine"
+
+
+def test_a_stop_for_any_loop_is_sent_to_the_rig_that_is_named(night, fitctl):
+    """Its supervisor may know loops that the file no longer has."""
+    (served,) = night("night")
+    settings = ("--set", "name=night", "--set", f"service.folder={served.folder}")
+
+    status, _, err = fitctl("send", "stop", "--loop", "gone", *settings)
+    assert status == 1
+    assert "no loop is named gone; the rig has right" in err
+
+
+def test_a_command_reaches_a_metrology_loop_of_the_file_that_is_named(fitctl, tmp_path):
+    testbed = str(default_rig_path().with_name("fit-testbed.toml"))
+    folder = f"service.folder={tmp_path / 'nobody'}"
+
+    status, _, err = fitctl("send", "off", "--loop", "metrology", "--rig", testbed, "--set", folder)
+    assert status == 1
+    assert "no supervisor answers" in err
+
+
+def test_doctor_queries_no_device_of_a_supervisor_in_another_folder(night, fitctl, monkeypatch):
+    night("night")
+    for driver in PROBES:
+        monkeypatch.setitem(PROBES, driver, lambda _: pytest.fail("a device was asked"))
+
+    _, out, _ = fitctl("doctor", "--json", "--set", "name=night")
+    assert json.loads(out)["asked"] == "supervisor"
+
+
+def test_doctor_queries_no_device_of_a_supervisor_that_hangs(night, fitctl, monkeypatch, tmp_path):
+    night()
+    for driver in PROBES:
+        monkeypatch.setitem(PROBES, driver, lambda _: pytest.fail("a device was asked"))
+    folder = make_service_folder(rig_in(tmp_path))
+    write_running(folder, "fit-mock", default_rig_path(), [f"service.folder={folder}"])
+    with name_held(supervisor_name(folder)):
+        status, _, err = fitctl("doctor", "--json")
+    assert status == 1
+    assert "The devices were not queried, because that would disturb it" in err

@@ -10,7 +10,9 @@ import pytest
 from fitctl.commands.operate import watch
 from fitctl.commands.operate.status import duration, status_document, status_lines
 from fitctl.commands.shared.printing import to_json, utc
+from fitctl.commands.shared.supervisor import print_reply
 from fitctl.logging.records import Event
+from fitctl.messages.commands import Reply
 from fitctl.messages.telemetry import LoopFailure, TrippedInterlock
 from fitctl.messages.troubles import RECORDER_SILENT_S, troubles
 from tests.instruments.fake_supervisor import STAR_LOST, FakeSupervisor
@@ -372,3 +374,33 @@ def test_each_line_of_json_says_what_it_is_of(monkeypatch):
 
     assert {line["kind"] for line in lines} == {"event", "second"}
     assert lines[0]["severity"] == "error"
+
+
+@pytest.mark.parametrize("wall_s", [math.nan, math.inf, 1e300, -1e30])
+def test_times_that_no_clock_can_have_are_left_out(wall_s):
+    """A remote program may send any number."""
+    message = told(wall_minus_monotonic_s=wall_s)
+    assert utc(message, message.time_s) == ""
+    assert status_document(message, [])["time"] == ""
+    assert status_lines(message, [])
+
+
+@pytest.mark.parametrize("since_s", [math.nan, -math.inf, -1e300])
+def test_a_time_in_a_mode_that_cannot_be_is_no_error(since_s):
+    message = told()
+    loops = [msgspec.structs.replace(loop, since_s=since_s) for loop in message.loops]
+    assert status_lines(told(loops=loops), [])
+
+
+def test_a_second_without_a_tick_has_no_time_of_computing():
+    timing = [msgspec.structs.replace(told().timing[0], ticks=0, compute_worst_s=math.nan)]
+    (line,) = [line for line in status_lines(told(timing=timing), []) if "last second" in line]
+    assert "nan" not in line
+    assert "0 late, 0 stalls of the machine" in line
+
+
+@pytest.mark.parametrize("time_s", [math.nan, 1e30])
+def test_an_event_at_a_time_that_cannot_be_is_printed(capsys, time_s):
+    event = Event(time_s=time_s, severity="info", source="right", message="here")
+    assert print_reply(Reply(accepted=True, events=[event]), "send", as_json=False) == 0
+    assert "at no time  info: right: here" in capsys.readouterr().out

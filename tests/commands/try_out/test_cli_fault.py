@@ -96,6 +96,10 @@ def test_a_fault_ends_after_its_time(fault):
         (["left.mdt693", "drop"], "no device is named left.mdt693; there are camera, right.drive"),
         (["camera", "drop", "5"], "takes no value"),
         (["camera", "delay", "nan"], "value"),
+        (
+            ["right.drive", "amplifier_fault", "70000", "--part", "az"],
+            "expected 0 to 65535 (error code",
+        ),
     ],
 )
 def test_what_cannot_be_is_one_line_and_status_2(fault, arguments, said):
@@ -104,6 +108,22 @@ def test_what_cannot_be_is_one_line_and_status_2(fault, arguments, said):
     which, why = err.splitlines()
     assert which.startswith("rig fit-mock: ")
     assert said in why
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["camera", "dorp"], "camera has no fault dorp; it has drop"),
+        (["right.drive", "amplifier_fault", "--part", "ez"], "has no part ez; it has az, el"),
+    ],
+)
+def test_a_fault_that_is_none_is_not_cleared(fault, arguments, said):
+    fault("set", "camera", "drop")
+    status, out, err = fault("clear", *arguments)
+    assert (status, out) == (2, "")
+    assert said in err
+    assert "camera drop" in fault("now")[1]
+    assert fault("clear", "camera", "drop")[0] == 0
 
 
 @pytest.mark.parametrize(
@@ -133,7 +153,7 @@ def test_another_program_at_the_bench_s_port_is_one_line(capsys, reply):
             main(["fault", "now", "--set", f"mocks.bench_port={port}"])
         answering.join(timeout=10)
 
-    assert end.value.code == 2
+    assert end.value.code == 1
     assert (
         f"another program answers at 127.0.0.1:{port}; expected the mocks"
         in capsys.readouterr().err
