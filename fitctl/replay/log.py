@@ -61,6 +61,7 @@ _BEFORE_TICK = {
     OutputsFound,
     StarPlace,
 }
+_MOST_PERIODS = 1e6  # of a servo between two reports, which come every second; each takes memory
 _AT_THE_END = {DeviceHealth, LoopTiming, Overlap, RecorderStatus}
 _TICKS = {Tick, MetrologyTick}
 KINDS: set[Any] = _BEGIN | _BEFORE_TICK | _AT_THE_END | _TICKS | {FrameRecord}
@@ -69,7 +70,7 @@ _STACKS = ("stack1_v", "stack2_v", "stack3_v")
 _OF_PLACES = {
     kind: [name for name, field_type in get_type_hints(kind).items() if field_type is float]
     for kind in (StarPlace, BeamPlace)
-}
+} | {LoopTiming: ["servo_periods"]}
 # The newest field that a replay needs of each kind of tick, and what a log without it lacks.
 _NEEDED = {
     Tick: ("fsm_written_s", "have neither commands nor when voltages took effect"),
@@ -270,14 +271,15 @@ def _is_over(step: LoggedStep, record: Logged, powered: bool) -> bool:
 
 
 def _insist_on_numbers(info: LogInfo, topic: str, kind: Any, message: Any, rig: Rig) -> None:
-    """Refuse times that cannot be counted from, outputs that no D/A has, and places that are none."""
+    """Refuse times that cannot be counted from, outputs that no D/A has, places and counts that are none."""
+    most = _MOST_PERIODS if kind is LoopTiming else MOST
     names: Sequence[str] = _TIMES if kind in _TICKS else _OF_PLACES.get(kind, ())
     has_outputs = kind is DevicesOpened and not message.error and message.loop in rig.stellar_loops
     if has_outputs:
         names = _STACKS
     for name in names:
         value = getattr(message, name, 0.0)
-        if abs(value) >= MOST or (math.isnan(value) and not _was_not(kind, message, name)):
+        if abs(value) >= most or (math.isnan(value) and not _was_not(kind, message, name)):
             msg = (
                 f"{info.path}: {topic} is not as fitctl records it: {name} is {value:g}; name a log that "
                 "fitctl recorded"

@@ -23,7 +23,7 @@ from fitctl.logging import schemas
 from fitctl.logging.errors import LogError
 from fitctl.logging.exporting import export
 from fitctl.logging.reading import log_info
-from fitctl.logging.records import ControllerChange, DevicesOpened, Event, Tick
+from fitctl.logging.records import ControllerChange, DevicesOpened, Event, LoopTiming, Tick
 from fitctl.logging.schemas import MESSAGES
 from fitctl.messages.command_table import command_record
 from fitctl.messages.commands import Reply, SetController
@@ -224,6 +224,16 @@ def test_outputs_that_no_d_a_has_are_refused(tmp_path, value):
     path = write_log(tmp_path / "a.mcap", [RUN_INFO, opened, tick(1), frame(1)])
 
     with pytest.raises(LogError, match=r"a\.mcap: .* is not as fitctl records it: stack2_v is "):
+        list(read_steps(log_info(path), load_rig(default_rig_path())))
+
+
+def test_more_periods_of_a_servo_than_a_second_has_are_refused(tmp_path):
+    timing = filled(LoopTiming, loop="right", servo_periods=2**31 - 1)
+    path = write_log(tmp_path / "a.mcap", [RUN_INFO, timing, tick(1), frame(1)])
+
+    with pytest.raises(
+        LogError, match=r"a\.mcap: .* is not as fitctl records it: servo_periods is 2"
+    ):
         list(read_steps(log_info(path), load_rig(default_rig_path())))
 
 
