@@ -348,7 +348,7 @@ def log_info(path: Path) -> LogInfo:
             if finished:
                 span_ns = _read_index(SeekingReader(stream), counts, described)
             else:
-                _scan(stream, counts, described, span_ns)
+                _scan(path, stream, counts, described, span_ns)
     return LogInfo(
         path=path,
         finished=finished,
@@ -448,17 +448,18 @@ def _read_index(
 
 
 def _scan(
+    path: Path,
     stream: IO[bytes],
     counts: Counter[str],
     described: list[Metadata],
     span_ns: list[int],
 ) -> None:
-    topics: dict[int, str] = {}
+    channels: Described[Channel] = Described(path)
     for entry in StreamReader(stream, validate_crcs=True).records:
         if isinstance(entry, Channel):
-            topics[entry.id] = entry.topic
+            channels[entry.id] = entry
         elif isinstance(entry, Metadata):
             described.append(entry)
         elif isinstance(entry, Message):
-            counts[topics[entry.channel_id]] += 1
+            counts[channels[entry.channel_id].topic] += 1
             span_ns[1:] = [entry.log_time]  # the first one stays

@@ -15,7 +15,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from fitctl.logging.copying import is_recoverable, recoverable
 from fitctl.logging.errors import ForeignTopicError, LogError
-from fitctl.logging.files import DAMAGE, MEND, damaged, opened
+from fitctl.logging.files import DAMAGE, MEND, Described, damaged, opened
 from fitctl.logging.folder import in_use
 from fitctl.logging.reading import log_info, own_times_s, read_records
 from fitctl.logging.records import FrameRecord, RecorderStatus
@@ -57,7 +57,9 @@ def verify(path: Path) -> Verdict:
         If it is missing, no MCAP log at all, or has topics in another format than protobuf.
     """
     with opened(path) as (stream, finished):
-        in_order, problems = _checked(stream) if finished else (Counter(), [_unfinished(path)])
+        in_order, problems = (
+            _checked(path, stream) if finished else (Counter(), [_unfinished(path)])
+        )
     if finished and problems:  # what its messages say is not worth reading
         sound = recoverable(path)
         problems.append(
@@ -122,19 +124,19 @@ def _unfinished(path: Path) -> str:
     return f"is cut off; {MEND}" if is_recoverable(path) else "is cut off before its first record"
 
 
-def _checked(stream: IO[bytes]) -> tuple[Counter[str], list[str]]:
+def _checked(path: Path, stream: IO[bytes]) -> tuple[Counter[str], list[str]]:
     """Messages by topic of a finished log, as they come in the file, and what its checksums complain of."""
     counts: Counter[str] = Counter()
-    topics: dict[int, str] = {}
+    channels: Described[Channel] = Described(path)
     ends: list[DataEnd | Footer] = []
     size = stream.seek(0, os.SEEK_END)
     stream.seek(0)
     try:
         for record in StreamReader(stream, validate_crcs=True, record_size_limit=size).records:
             if isinstance(record, Channel):
-                topics[record.id] = record.topic
+                channels[record.id] = record
             elif isinstance(record, Message):
-                counts[topics[record.channel_id]] += 1
+                counts[channels[record.channel_id].topic] += 1
             elif isinstance(record, DataEnd | Footer):
                 ends.append(record)
         footer = ends[-1]

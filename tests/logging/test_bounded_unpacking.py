@@ -15,6 +15,7 @@ from fitctl.logging.errors import LogError
 from fitctl.logging.reading import log_info, read_records
 from fitctl.logging.schemas import dark_npy_of
 from fitctl.logging.seeking import SeekableLog
+from fitctl.logging.verifying import verify
 
 BOMB_BYTES = 300 << 20
 
@@ -52,6 +53,26 @@ def test_a_chunk_that_unpacks_to_too_much_is_damage(compression, finished, tmp_p
         tracemalloc.stop()
 
     assert peak < BOMB_BYTES
+
+
+@pytest.mark.parametrize(("read", "finished"), [(log_info, False), (verify, True)])
+def test_channels_that_unpack_to_too_much_are_refused(read, finished, tmp_path):
+    path = tmp_path / "channels.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(
+            stream, compression=CompressionType.ZSTD, chunk_size=1 << 30, repeat_channels=False
+        )
+        writer.start()
+        schema = writer.register_schema("x", "protobuf", b"")
+        for number in range(20):
+            channel = writer.register_channel(f"/{number}{'x' * (1 << 20)}", "protobuf", schema)
+        writer.add_message(channel, 1, b"", 1)
+        writer.finish()
+    if not finished:
+        path.write_bytes(path.read_bytes()[:-8])  # as of a recorder that was killed
+
+    with pytest.raises(LogError, match="schemas or channels of more than 16 MiB"):
+        read(path)
 
 
 @pytest.mark.parametrize("read", [lambda path: list(read_records(path)), SeekableLog])

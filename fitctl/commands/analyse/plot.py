@@ -73,7 +73,9 @@ def plot(
     from_ns = 0 if from_ is None else time_ns("--from", from_, found)
     to_ns = 2**63 - 1 if to is None else time_ns("--to", to, found)
     if to_ns <= from_ns:
-        msg = f"plot: --to {to} is not after {f'--from {from_}' if from_ else 'the first record'}"
+        begin = f"--from {from_}" if from_ else "the first record"
+        end = "the last record" if to is None else f"--to {to}"
+        msg = f"plot: {end} is not after {begin}"
         raise ConfigError(f"{msg}; choose a later --to, or an earlier --from")
     series = read_series(log, what, from_ns, to_ns, None if mode is None else _mode(mode))
     if not any(len(one.time_s) for one in series):

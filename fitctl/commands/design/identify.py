@@ -17,9 +17,9 @@ from fitctl.commands.shared.exits import FAILED, UNUSABLE
 from fitctl.commands.shared.logs import LatestOption, chosen_log
 from fitctl.commands.shared.options import JsonOption, LoopOption, RigOption, SeedOption, SetOption
 from fitctl.commands.shared.printing import progress_line, say, to_json
-from fitctl.commands.shared.rig import require_loop, rig_of
+from fitctl.commands.shared.rig import named_rig, require_loop, rig_of
 from fitctl.commands.shared.supervisor import address, address_or_shipped, client_of, show_rig
-from fitctl.config import ConfigError, Rig, default_rig_path
+from fitctl.config import ConfigError, Rig, default_rig_path, rig_from_log
 from fitctl.files import write_whole
 from fitctl.identify.errors import IdentifyError
 from fitctl.identify.experiments import (
@@ -29,7 +29,7 @@ from fitctl.identify.experiments import (
 )
 from fitctl.identify.fragments import fragment_text
 from fitctl.identify.run import Progress, on_rig, on_simulation, require_vernier
-from fitctl.logging.reading import logs_of_one_run_each
+from fitctl.logging.reading import log_info, logs_of_one_run_each
 from fitctl.messages.modes import Mode
 from fitctl.processes import ended_by_signals, interrupt
 
@@ -95,30 +95,26 @@ def identify(
     if what not in EXPERIMENTS:
         msg = f"identify: unknown experiment {what!r}. Available: {', '.join(EXPERIMENTS)}"
         raise ConfigError(msg)
+    given, is_named = overrides or [], named_rig(rig) is not None
     if latest:
         found = address_or_shipped("identify", rig, overrides)
         rig, overrides = found.file, found.settings
         log = chosen_log("identify", log, rig, latest=True)
     step = EXPERIMENTS[what].step
-    if step and log is None:
-        msg = (
-            f"identify: {what} is evaluated from the log of a sequence with the step {step}; run one with "
-            f"fitctl sequence run, and name its log with --log, or with --latest"
-        )
-        raise ConfigError(msg)
-    if (log is not None) + simulated + mock > 1:
-        msg = "identify: --log, --simulate and --mocks exclude each other; give one, or none for the rig"
-        raise ConfigError(msg)
+    _require_one_source(what, step, log, simulated=simulated, mock=mock, seed=seed)
     if not (log or simulated or mock):
         found = address("identify", rig, overrides)
         rig, overrides = found.file, found.settings
-    settings = rig_of(rig, overrides)
-    if not (log or simulated or mock):
-        show_rig(settings.name, str(rig))
+        show_rig(rig_of(rig, overrides).name, str(rig))
+    # The log of a response is a file of the bench, which has no rig.
+    log_of_run = None if what == "response" else log
+    if log_of_run is not None:
+        logs_of_one_run_each([log_of_run])
+    settings = (
+        rig_of(rig, overrides) if log_of_run is None or is_named else _rig_in(log_of_run, given)
+    )
     if not step or loop not in settings.loops:
         require_loop("identify", settings, loop)
-    if log is not None and what != "response":  # which is from a file of the bench
-        logs_of_one_run_each([log])
     source = Source(log, simulated, mock, seed)
     by = f"fitctl identify {what}{' --simulate' * simulated}{' --mocks' * mock}"
     fragment_path = out or Path(f"{settings.name}-{loop}-{what}.toml")
@@ -145,6 +141,34 @@ def identify(
     for line in finding.lines():
         say(line)
     say(f"written: {fragment_path} (name it in the rig file's include list), {plot_path}")
+
+
+def _require_one_source(
+    what: str, step: str, log: Path | None, *, simulated: bool, mock: bool, seed: int
+) -> None:
+    if step and log is None:
+        msg = (
+            f"identify: {what} is evaluated from the log of a sequence with the step {step}; run one with "
+            f"fitctl sequence run, and name its log with --log, or with --latest"
+        )
+        raise ConfigError(msg)
+    if (log is not None) + simulated + mock > 1:
+        msg = "identify: --log, --simulate and --mocks exclude each other; give one, or none for the rig"
+        raise ConfigError(msg)
+    if seed and not (simulated or mock):
+        msg = "identify: --seed is for --simulate and --mocks; leave it out"
+        raise ConfigError(msg)
+
+
+def _rig_in(log: Path, overrides: list[str]) -> Rig:
+    """The rig that a log was recorded with, for people too."""
+    in_log = log_info(log).metadata.get("rig", {}).get("json")
+    if in_log is None:
+        msg = f"identify: {log}: has no rig file in it; name one with --rig"
+        raise ConfigError(msg)
+    rig = rig_from_log(in_log, f"the rig in {log}", overrides)
+    show_rig(rig.name, f"in {log}")
+    return rig
 
 
 def _plot_path(fragment: Path, wanted: Path | None, by: str) -> Path:

@@ -9,7 +9,9 @@ from samples.forged_logs import forged
 from samples.log_samples import RUN_INFO, WALL_S, one_of_each, tick, write_log
 
 from fitctl.cli import main
+from fitctl.commands.design import identify
 from fitctl.config import default_rig_path, load_rig
+from fitctl.identify.errors import IdentifyError
 from fitctl.logging.copying import merge, recover
 from fitctl.logging.listing import logs_in, newest_run
 from fitctl.report.run import find_run
@@ -335,6 +337,38 @@ def test_a_rig_beside_a_log_is_refused_where_it_would_say_nothing(fitctl, logs, 
     assert (
         problem == f"{' '.join(command[:2])}: --rig is for --latest; leave it out, or logs/b.mcap"
     )
+
+
+@pytest.mark.parametrize(("named", "of"), [([], "another"), (["--rig", default_rig_path()], RIG)])
+def test_identify_uses_the_rig_of_the_log_unless_one_is_named(fitctl, logs, monkeypatch, named, of):
+    monkeypatch.delenv("FITCTL_RIG")
+    used = []
+
+    def finding(rig, *_):
+        used.append(rig.name)
+        msg = "nothing"
+        raise IdentifyError(msg)
+
+    monkeypatch.setattr(identify, "_finding", finding)
+    another = load_rig(default_rig_path(), ["name=another"]).model_dump_json()
+    info = msgspec.structs.replace(RUN_INFO, rig_name="another", rig_json=another)
+    write_log(logs / "own.mcap", [info, *one_of_each()])
+
+    status, _, problem = fitctl("identify", "spot", "--log", "logs/own.mcap", *named)
+
+    assert (status, used) == (2, [of])
+    assert ("rig another: in logs/own.mcap" in problem) == (not named)
+
+
+def test_a_seed_that_nothing_uses_is_refused(fitctl, logs):
+    status, _, problem = fitctl("identify", "spot", "--log", "logs/b.mcap", "--seed", "7")
+    assert status == 2
+    assert problem == "identify: --seed is for --simulate and --mocks; leave it out"
+
+
+def test_a_plot_that_begins_after_the_end_names_no_end(fitctl, logs):
+    _, _, problem = fitctl("plot", "logs/b.mcap", "record*", "--from", "1e20")
+    assert problem.startswith("plot: the last record is not after --from 1e20")
 
 
 def test_identify_refuses_a_log_of_several_runs(fitctl, logs):
