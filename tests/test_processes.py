@@ -1,5 +1,6 @@
 """fitctl's processes share the processor: those that point the star go first."""
 
+import os
 import subprocess
 import sys
 
@@ -34,7 +35,8 @@ def niceness_of_session(said):
 
 
 def test_a_process_that_gives_way_is_niced():
-    assert output(sys.executable, "-c", GIVES_WAY) == "7\n"
+    ours = os.nice(0)  # the tests themselves may give way
+    assert output(sys.executable, "-c", GIVES_WAY) == f"{min(ours + 7, 19)}\n"
 
 
 def test_a_session_of_its_own_gives_way_as_a_whole():
