@@ -38,6 +38,8 @@ class CommandRow(NamedTuple):
         Each gets a record of its own in the log; reports, which come every second, do not.
     wait_s : float
         How long ``fitctl send`` waits by default for its outcome; 0 for a command whose reply is its outcome.
+    of_rig : bool
+        It is for the whole rig, and for no single loop.
     """
 
     make: type[AnyCommand]
@@ -48,6 +50,7 @@ class CommandRow(NamedTuple):
     question: str = ""
     logged: bool = True
     wait_s: float = 0.0
+    of_rig: bool = False
 
     @property
     def name(self) -> str:
@@ -113,12 +116,12 @@ COMMANDS = (
     CommandRow(commands.SetBiasOffset, "the instrument", "bias-offset"),
     CommandRow(commands.SetController, "the instrument", "controller", wait_s=120.0),
     CommandRow(commands.Reset, "the instrument", "reset"),
-    CommandRow(commands.MoveCollector, "the instrument", "collector"),
-    CommandRow(commands.FrameRate, "the instrument", "frame-rate"),
-    CommandRow(commands.Status, "any key", "status", logged=False),
-    CommandRow(commands.RecentEvents, "any key", "events", logged=False),
-    CommandRow(commands.TakeOver, "a commander's key", "take-over"),
-    CommandRow(commands.Shutdown, "the instrument", "shutdown", wait_s=120.0),
+    CommandRow(commands.MoveCollector, "the instrument", "collector", of_rig=True),
+    CommandRow(commands.FrameRate, "the instrument", "frame-rate", of_rig=True),
+    CommandRow(commands.Status, "any key", "status", logged=False, of_rig=True),
+    CommandRow(commands.RecentEvents, "any key", "events", logged=False, of_rig=True),
+    CommandRow(commands.TakeOver, "a commander's key", "take-over", of_rig=True),
+    CommandRow(commands.Shutdown, "the instrument", "shutdown", wait_s=120.0, of_rig=True),
     CommandRow(commands.Experiment, "the instrument", label="Experiment"),
     CommandRow(commands.SequenceControl, "a commander's key", label="Sequence control"),
     CommandRow(commands.SequenceReport, "a commander's key", logged=False),
@@ -131,13 +134,6 @@ ROWS = {row.make: row for row in COMMANDS}
 RENAMED = {"hold": "release"}
 """Words of an older fitctl, which are refused with the word of today."""
 WORDS = {row.word: row for row in COMMANDS if row.word}
-_OF_THE_RIG = frozenset(
-    {
-        *(commands.Status, commands.RecentEvents, commands.TakeOver, commands.Shutdown),
-        *(commands.MoveCollector, commands.FrameRate),
-    }
-)
-"""These are for no single loop."""
 
 
 def command_of(word: str, values: Sequence[str], loop: str, caller: str = "send") -> AnyCommand:
@@ -156,7 +152,7 @@ def command_of(word: str, values: Sequence[str], loop: str, caller: str = "send"
         msg = f"{caller}: unknown command {shown!r}. Available: {', '.join(WORDS)}"
         raise ConfigError(msg)
     row = WORDS[word]
-    if loop and row.make in _OF_THE_RIG:
+    if loop and row.of_rig:
         msg = f"{caller}: {word} is for the whole rig; expected no loop, got {loop}"
         raise ConfigError(msg)
     named = [text for text in values if "=" in text and text.partition("=")[0] in row.options]

@@ -67,7 +67,8 @@ _TICKS = {Tick, MetrologyTick}
 KINDS: set[Any] = _BEGIN | _BEFORE_TICK | _AT_THE_END | _TICKS | {FrameRecord}
 _TIMES = ("time_s", "mid_exposure_s", "compute_s", "requested_s")  # of ticks
 _STACKS = ("stack1_v", "stack2_v", "stack3_v")
-_OF_PLACES = {
+# Fields that must be numbers in which one can count, of what is no tick.
+_NUMBERS = {
     kind: [name for name, field_type in get_type_hints(kind).items() if field_type is float]
     for kind in (StarPlace, BeamPlace)
 } | {LoopTiming: ["servo_periods"]}
@@ -273,7 +274,7 @@ def _is_over(step: LoggedStep, record: Logged, powered: bool) -> bool:
 def _insist_on_numbers(info: LogInfo, topic: str, kind: Any, message: Any, rig: Rig) -> None:
     """Refuse times that cannot be counted from, outputs that no D/A has, places and counts that are none."""
     most = _MOST_PERIODS if kind is LoopTiming else MOST
-    names: Sequence[str] = _TIMES if kind in _TICKS else _OF_PLACES.get(kind, ())
+    names: Sequence[str] = _TIMES if kind in _TICKS else _NUMBERS.get(kind, ())
     has_outputs = kind is DevicesOpened and not message.error and message.loop in rig.stellar_loops
     if has_outputs:
         names = _STACKS

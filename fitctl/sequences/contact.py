@@ -56,9 +56,8 @@ class Contact:
         self.status = SequenceStatus(run=uuid.uuid4().hex, name=name, state="running", steps=steps)
         self.link = link
         self.rig = rig
-        self.loops: dict[
-            str, None
-        ] = {}  # that have had a step, in their order; also the present one
+        # Those that have had a step, in their order; also the one of the present step.
+        self.loops: dict[str, None] = {}
         self._on_status = on_status
         self._wanted = "run"
         self._reported_s = 0.0

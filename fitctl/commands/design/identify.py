@@ -105,7 +105,6 @@ def identify(
     if not (log or simulated or mock):
         found = address("identify", rig, overrides)
         rig, overrides = found.file, found.settings
-        show_rig(rig_of(rig, overrides).name, str(rig))
     # The log of a response is a file of the bench, which has no rig.
     log_of_run = None if what == "response" else log
     if log_of_run is not None:
@@ -113,6 +112,8 @@ def identify(
     settings = (
         rig_of(rig, overrides) if log_of_run is None or is_named else _rig_in(log_of_run, given)
     )
+    if not (log or simulated or mock):
+        show_rig(settings.name, str(rig))
     if not step or loop not in settings.loops:
         require_loop("identify", settings, loop)
     source = Source(log, simulated, mock, seed)

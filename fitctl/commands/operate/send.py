@@ -10,10 +10,9 @@ from typer.core import TyperCommand
 from fitctl.commands.shared import completion
 from fitctl.commands.shared.options import JsonOption, RemoteOption, RigOption, SetOption
 from fitctl.commands.shared.printing import say
-from fitctl.commands.shared.rig import named_rig, rig_of
+from fitctl.commands.shared.rig import named_rig, require_loop, rig_of
 from fitctl.commands.shared.supervisor import connect, send_and_print, send_to_all
 from fitctl.commands.shared.terminal import has_terminal
-from fitctl.config import ConfigError
 from fitctl.messages.command_table import ROWS, WORDS, command_of
 from fitctl.messages.commands import AnyCommand, Stop
 from fitctl.messages.running import running_rigs
@@ -71,12 +70,10 @@ def send(
         if len(running) > 1:
             say(f"send: {len(running)} supervisors run; stopping all of them", err=True)
             raise typer.Exit(send_to_all(running, wanted, "send", as_json=as_json))
-    # A stop is never refused here: whoever runs knows its own loops.
+    # `send` rejects no stop: the supervisor knows its loops, and the file may have changed since.
     if remote is None and loop and (named_rig(rig) or overrides) and not isinstance(wanted, Stop):
         described = rig_of(named_rig(rig), overrides)
-        if loop not in described.loops:
-            msg = f"send: --loop {loop!r}: rig {described.name} has {', '.join(described.loops)}"
-            raise ConfigError(msg)
+        require_loop("send", described, loop, described.loops)
     client = connect("send", rig, overrides, remote)
     wait_s = _wait_s(wanted, wait, timeout_s)
     raise typer.Exit(send_and_print(client, wanted, "send", wait_s, as_json=as_json))

@@ -97,7 +97,7 @@ def _running_supervisor(rig: Rig, path: Path, overrides: Sequence[str]) -> Telem
     """A message of the rig's supervisor on this machine, if one runs, in whatever folder.
 
     One that has just started reports its devices within a second or two. If one runs and does not answer,
-    doctor ends: nobody else may query its devices.
+    doctor ends, because querying the devices would disturb it.
     """
     here, wanted = service_folder(rig), (str(path.absolute()), _devices_settings(overrides))
     runs = [

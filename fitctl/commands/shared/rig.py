@@ -53,14 +53,15 @@ def controller_overrides(loops: Iterable[str], controller: str) -> list[str]:
     return [f"loops.{name}.vernier.controller={controller}" for name in loops]
 
 
-def require_loop(command: str, rig: Rig, loop: str) -> None:
-    """Reject a loop that the rig does not have, or that points no star.
+def require_loop(command: str, rig: Rig, loop: str, loops: Iterable[str] | None = None) -> None:
+    """Reject a loop that is none of `loops`; without these, one that is no stellar loop of the rig.
 
     Raises
     ------
     ConfigError
         If so.
     """
-    if loop not in rig.stellar_loops:
-        msg = f"{command}: --loop {loop!r}: rig {rig.name} has {', '.join(rig.stellar_loops)}"
+    possible = list(rig.stellar_loops if loops is None else loops)
+    if loop not in possible:
+        msg = f"{command}: --loop {loop!r}: rig {rig.name} has {', '.join(possible)}"
         raise ConfigError(msg)

@@ -309,19 +309,28 @@ def test_a_command_reaches_a_metrology_loop_of_the_file_that_is_named(fitctl, tm
     assert "no supervisor answers" in err
 
 
-def test_doctor_queries_no_device_of_a_supervisor_in_another_folder(night, fitctl, monkeypatch):
-    night("night")
+@pytest.fixture
+def no_device(monkeypatch):
+    """A device that doctor queries is an error."""
+
+    def query(_settings):
+        pytest.fail("doctor queried a device of a running supervisor")
+
     for driver in PROBES:
-        monkeypatch.setitem(PROBES, driver, lambda _: pytest.fail("a device was asked"))
+        monkeypatch.setitem(PROBES, driver, query)
+
+
+@pytest.mark.usefixtures("no_device")
+def test_doctor_queries_no_device_of_a_supervisor_in_another_folder(night, fitctl):
+    night("night")
 
     _, out, _ = fitctl("doctor", "--json", "--set", "name=night")
     assert json.loads(out)["asked"] == "supervisor"
 
 
-def test_doctor_queries_no_device_of_a_supervisor_that_hangs(night, fitctl, monkeypatch, tmp_path):
+@pytest.mark.usefixtures("no_device")
+def test_doctor_queries_no_device_of_a_supervisor_that_hangs(night, fitctl, tmp_path):
     night()
-    for driver in PROBES:
-        monkeypatch.setitem(PROBES, driver, lambda _: pytest.fail("a device was asked"))
     folder = make_service_folder(rig_in(tmp_path))
     write_running(folder, "fit-mock", default_rig_path(), [f"service.folder={folder}"])
     with name_held(supervisor_name(folder)):
