@@ -26,6 +26,7 @@ from fitctl.messages.commands import AnyCommand, Experiment, Reply
 from fitctl.messages.modes import Mode, Trigger
 from fitctl.sequences.contact import Contact
 from fitctl.sequences.view import View
+from fitctl.service import service
 from fitctl.stages.mirror import MirrorStage
 from fitctl.stages.servo import SiderostatServo
 from fitctl.stages.siderostat import SiderostatStage
@@ -60,8 +61,9 @@ def _post_waits(
     reply: Callable[[Reply], None],
     sender: str = "",
     address: str = "",
+    waits_since_s: float = math.inf,
 ) -> None:
-    self._commands.append(Posted(command, reply, sender, address))
+    self._commands.append(Posted(command, reply, sender, address, waits_since_s))
 
 
 def _ask_while_dac_ready(self: PiezoWatch) -> None:
@@ -376,6 +378,14 @@ DEFECTS = {
         [
             (supervisor, "obey_loop_command", _experiment_though_it_waits),
             (StellarLoop, "_evaluate_waiting", _experiments_on),
+        ],
+    ),
+    "obeyed-late": Defect(
+        "this commit",
+        "a command that waited for a supervisor that stood still is carried out, long after its sender gave up",
+        [
+            (module, "why_too_old", lambda _command, _since_s, _now_s: "")
+            for module in (service, supervisor)
         ],
     ),
     "sequence-in-safe": Defect(

@@ -34,12 +34,15 @@ from fitctl.logging.records import (
     PiezoReading,
     Tick,
 )
+from fitctl.messages.client import REPLY_TIMEOUT_S
+from fitctl.messages.command_table import ROWS
 from fitctl.messages.commands import (
     AnyCommand,
     RecentEvents,
     RecorderReport,
     Reply,
     Status,
+    Stop,
     TakeOver,
 )
 from fitctl.messages.telemetry import Telemetry
@@ -66,6 +69,15 @@ _GARBAGE = 0.02  # of the messages
 _MOST_GARBAGE_BYTES = 200
 # So many refusals within that time may be followed by some without an answer.
 _FLOOD, _FLOOD_S = 20, 2.0
+
+
+class _Sent(NamedTuple):
+    """A message, when it was sent, and who takes the answer; garbage is no command."""
+
+    sender: Sender
+    command: AnyCommand | None
+    at_s: float
+    reply: Callable[[Reply], None]
 
 
 class _Frame(NamedTuple):
@@ -233,10 +245,14 @@ class SwarmService(Service):
         post = supervisor.post
 
         def watched_post(
-            command: AnyCommand, reply: Callable[[Reply], None], sender: str, address: str
+            command: AnyCommand,
+            reply: Callable[[Reply], None],
+            sender: str,
+            address: str,
+            waits_since_s: float,
         ) -> None:
             invariants.obeyed(command, sender)
-            post(command, reply, sender, address)
+            post(command, reply, sender, address, waits_since_s)
 
         supervisor.post = watched_post  # pyrefly: ignore[bad-assignment]
         self._admission = _WatchedAdmission(supervisor.rig.service.lease_s, invariants)
@@ -249,7 +265,7 @@ class SwarmService(Service):
         self._wire.answered = self._take_answer
         self._random = self._wire.random
         self._decode = msgspec.msgpack.Decoder(Reply).decode
-        self._sent: dict[bytes, tuple[Sender, AnyCommand | None, Callable[[Reply], None]]] = {}
+        self._sent: dict[bytes, _Sent] = {}
         self._arrives_s: dict[str, float] = {}  # by sender: no message overtakes another
         self._refused_s: dict[str, deque[float]] = {}  # by sender: when, of the newest
         self._ended = VirtualEvent(time)
@@ -299,14 +315,20 @@ class SwarmService(Service):
         reply: Callable[[Reply], None],
     ) -> None:
         tag = len(self._sent).to_bytes(8, "big")
-        self._sent[tag] = sender, command, reply
+        self._sent[tag] = _Sent(sender, command, self._time.now_s(), reply)
+        at_s = self._time.now_s() + self._delay_s(sender)
+        at_s = self._arrives_s[sender.name] = max(at_s, self._arrives_s.get(sender.name, 0.0))
         door = self._local if sender.is_local else self._gateway
         if not sender.is_local:
             payload = self._encode(
-                Passed(name=sender.name, role=sender.role, address=sender.address, payload=payload)
+                Passed(
+                    name=sender.name,
+                    role=sender.role,
+                    address=sender.address,
+                    payload=payload,
+                    waits_since_s=at_s,
+                )
             )
-        at_s = self._time.now_s() + self._delay_s(sender)
-        at_s = self._arrives_s[sender.name] = max(at_s, self._arrives_s.get(sender.name, 0.0))
         router: Any = door.router
         self._time.call_at(at_s, partial(router.arrive, sender, tag, payload))
 
@@ -314,22 +336,22 @@ class SwarmService(Service):
         return self._random.uniform(*(_LOCAL_S if sender.is_local else _REMOTE_S))
 
     def _take_answer(self, tag: bytes, payload: bytes) -> None:
-        sender, _, reply = self._sent[tag]
-        at_s = self._time.now_s() + self._delay_s(sender)
-        self._time.call_at(at_s, lambda: reply(self._decode(payload)))
+        sent = self._sent[tag]
+        at_s = self._time.now_s() + self._delay_s(sent.sender)
+        self._time.call_at(at_s, lambda: sent.reply(self._decode(payload)))
 
     # ------------------------------------------------------------ the service's side
 
-    def _receive(self, waiting: Waiting, payload: bytes) -> None:
-        sender, _, _ = self._sent[waiting.tag]
+    def _receive(self, waiting: Waiting, payload: bytes, waits_since_s: float) -> None:
+        sender = self._sent[waiting.tag].sender
         if waiting.sender != sender:
             detail = f"{sender} sent it, and it counts as sent by {waiting.sender}"
             self._invariants.violated("a command is its sender's", detail)
-        super()._receive(waiting, payload)
+        super()._receive(waiting, payload, waits_since_s)
 
     def _refuse(self, waiting: Waiting, reply: Reply, now_s: float) -> None:
         """A sender elsewhere that is refused too often is not answered each time; the others are counted."""
-        sender, _, answered = self._sent[waiting.tag]
+        sender, answered = waiting.sender, self._sent[waiting.tag].reply
         refused_s = self._refused_s.setdefault(sender.name, deque(maxlen=_FLOOD))
         refused_s.append(now_s)
         before = self._withheld(sender)
@@ -343,11 +365,27 @@ class SwarmService(Service):
         return self._intake._dropped[sender.name, "refused without an answer"]
 
     def _done(self, waiting: Waiting, stopped: str | None, reply: Reply) -> None:
-        _, command, _ = self._sent[waiting.tag]
+        command = self._sent[waiting.tag].command
         if command is not None:
             self._invariants.answered(command, reply)
+            self._in_time(waiting, command, reply)
         super()._done(waiting, stopped, reply)
         self._wire.some.set()
+
+    def _answer_here(self, waiting: Waiting, command: AnyCommand, reply: Reply) -> None:
+        self._in_time(waiting, command, reply)
+        super()._answer_here(waiting, command, reply)
+
+    def _in_time(self, waiting: Waiting, command: AnyCommand, reply: Reply) -> None:
+        """A command whose sender was told that nobody answers is not carried out after that; a stop is."""
+        waited_s = self._time.now_s() - self._sent[waiting.tag].at_s
+        most_s = REPLY_TIMEOUT_S + (0.0 if waiting.sender.is_local else _REMOTE_S[1])
+        matters = ROWS[type(command)].logged and not isinstance(command, Stop)
+        if reply.accepted and matters and waited_s > most_s:
+            self._invariants.violated(
+                "a command whose sender has given up is not carried out",
+                f"{type(command).__name__} after {waited_s:.2f} s",
+            )
 
     def _publish(self, now_s: float) -> None:
         self._wire.due_s = now_s + self._period_s

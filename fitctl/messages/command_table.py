@@ -14,7 +14,7 @@ import msgspec
 from fitctl.config import ConfigError
 from fitctl.logging.records import CommandRecord
 from fitctl.messages import commands
-from fitctl.messages.commands import AnyCommand, Command, Reply
+from fitctl.messages.commands import AnyCommand, Command, Reply, Stop
 
 Needs = Literal["any key", "the Unix socket", "a commander's key", "the instrument"]
 
@@ -128,6 +128,8 @@ COMMANDS = (
     CommandRow(commands.RecorderReport, "the Unix socket", logged=False),
     CommandRow(commands.LearnerReport, "the Unix socket"),
 )
+MOST_WAIT_S = 1.75
+"""What has waited longer is not carried out: its sender gives up after ``REPLY_TIMEOUT_S``, and says so."""
 _MOST_SHOWN = 40  # characters of a word that is no command
 _LOGGED_OF_REFUSED = 100  # characters of its loop, of its values and of the answer
 ROWS = {row.make: row for row in COMMANDS}
@@ -217,6 +219,20 @@ def as_command(command: AnyCommand | str, loop: str = "") -> AnyCommand:
         )
         raise TypeError(msg)
     return command
+
+
+def why_too_old(command: AnyCommand, waits_since_s: float, now_s: float) -> str:
+    """Why a command that may have waited since then is refused; empty if it is not.
+
+    A stop is carried out however late; reports and questions, which are not logged one by one, change nothing.
+    """
+    waited_s = now_s - waits_since_s
+    if waited_s <= MOST_WAIT_S or isinstance(command, Stop) or not ROWS[type(command)].logged:
+        return ""
+    return (
+        f"{type(command).__name__} may have waited for {waited_s:.1f} s, because the supervisor or its gateway "
+        f"stood still; after {MOST_WAIT_S:g} s a command is not carried out: send it again"
+    )
 
 
 def command_record(

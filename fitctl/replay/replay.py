@@ -61,7 +61,7 @@ from fitctl.replay.result import (
 )
 from fitctl.stages.journal import Journal
 from fitctl.stages.siderostat import SiderostatStage
-from fitctl.supervisor.supervisor import Supervisor
+from fitctl.supervisor.supervisor import GOES_TO_BIAS, Supervisor
 from fitctl.text import UNDECODABLE
 
 # Who commands is not replayed; a sequence leads to commands of its own, which are in the log as well. What a
@@ -162,8 +162,7 @@ class Replay:
         for reading in step.of(PiezoReading):
             supervisor.piezos[reading.loop].evaluate(_piezo_answer(reading))
         for command in step.of(CommandRecord):
-            # A refused Off takes the mirror to its bias.
-            if not command.accepted and command.command != "Off":
+            if not command.accepted and GOES_TO_BIAS not in command.text:
                 continue
             if command.command not in self._left_out:
                 self._post(command)

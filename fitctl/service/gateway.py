@@ -76,7 +76,13 @@ def admit(
     accepted = intake.accept(key.name, key.role, payload, now_s)
     if isinstance(accepted, Reply):
         return accepted
-    return Passed(name=key.name, role=key.role, address=address, payload=payload)
+    return Passed(
+        name=key.name,
+        role=key.role,
+        address=address,
+        payload=payload,
+        waits_since_s=intake.waits_since_s,
+    )
 
 
 class Gateway:
@@ -142,6 +148,7 @@ class Gateway:
             while not ending.is_set():
                 busy = poller.poll(int(_LOOK_S * 1000))
                 now_s = self._clock.now_s()
+                self._intake.begin_round(now_s)
                 if now_s >= look_s:
                     self._alive()
                     self._connect()
@@ -186,10 +193,10 @@ class Gateway:
         self._unsafe = ""
 
     def _pass_commands(self) -> None:
-        """Take some, as long as the supervisor takes them too; the rest waits with its sender."""
+        """Take some; the rest waits with its sender."""
         served = 0
         for _ in range(_DROPPED_A_ROUND):
-            if served == MESSAGES_A_ROUND or not self._supervisor.poll(0, zmq.POLLOUT):
+            if served == MESSAGES_A_ROUND:
                 return
             for parcel in self._keyed.door.receive(1):
                 served += self._receive(parcel)

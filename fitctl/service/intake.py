@@ -6,10 +6,12 @@ few seconds, so that a flood costs neither the loop its time nor the log its roo
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Collection
 from typing import NamedTuple
 
+from fitctl.messages.command_table import ROWS
 from fitctl.messages.commands import AnyCommand, Reply, Stop, decode_command
 from fitctl.messages.keys import Role
 
@@ -20,6 +22,8 @@ _LOGGED_REFUSALS_PER_S = 1.0
 _LOGGED_REFUSALS_AT_ONCE = 10.0
 # Beside the rate of commands. Somebody who needs to stop needs one; reading a flood of them takes all the time.
 _STOPS_PER_S = 50.0
+_STANDSTILL_S = 1.0  # between two rounds; what a shorter one leaves unread is read in the next
+_CAUGHT_UP_S = 0.5  # after a standstill, until what came meanwhile has been read
 
 
 class Accepted(NamedTuple):
@@ -55,6 +59,11 @@ class Intake:
         From one person; as many may come at once.
     loops : collection of str
         The rig's loops: a stop for another one is not exempt from the rate.
+
+    Attributes
+    ----------
+    waits_since_s : float
+        Since when a message that is read in this round may have waited for the process.
     """
 
     def __init__(self, commands_per_s: float, loops: Collection[str]) -> None:
@@ -69,6 +78,17 @@ class Intake:
         self._records = Limit(_LOGGED_REFUSALS_PER_S, _LOGGED_REFUSALS_AT_ONCE)
         self._dropped: Counter[tuple[str, str]] = Counter()
         self._report_s = 0.0
+        self._round_s = self.waits_since_s = math.inf
+        self._caught_up_s = -math.inf
+
+    def begin_round(self, now_s: float) -> None:
+        """Messages are read from now on; the process may have stood still since the round before."""
+        if now_s - self._round_s > _STANDSTILL_S:
+            self.waits_since_s = self._round_s
+            self._caught_up_s = now_s + _CAUGHT_UP_S
+        elif now_s > self._caught_up_s:
+            self.waits_since_s = min(self._round_s, now_s)
+        self._round_s = now_s
 
     def accept(self, name: str, role: Role, payload: bytes, now_s: float) -> Accepted | Reply:
         """Decode somebody's message: the command in it, or why it is rejected.
@@ -87,6 +107,9 @@ class Intake:
         if isinstance(command, Reply):
             self.drop(name, "no commands")
             return command
+        if command.loop and ROWS[type(command)].of_rig:
+            text = f"{type(command).__name__} is for the whole rig; expected no loop, got {command.loop}"
+            return Reply(accepted=False, text=text)
         return Accepted(command, not within_rate)
 
     def answers_refusal(self, name: str, now_s: float) -> bool:

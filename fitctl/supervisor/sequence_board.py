@@ -6,7 +6,7 @@ from typing import Literal
 
 import msgspec
 
-from fitctl.logging.records import Severity
+from fitctl.logging.records import MOST, Severity
 from fitctl.messages.commands import Reply, SequenceStatus
 from fitctl.stages.journal import Journal
 
@@ -48,7 +48,13 @@ class SequenceBoard:
         return status is not None and status.state in _UNDER_WAY
 
     def report(self, status: SequenceStatus) -> Reply:
-        """Take a sequence's word, unless another is under way."""
+        """Take a sequence's word, unless another is under way, or it has numbers that cannot be."""
+        if not _is_possible(status, self._clock.now_s()):
+            text = (
+                f"sequence {status.name}: expected numbers of steps, and times between 0 and now; "
+                "report what a sequence has done"
+            )
+            return Reply(accepted=False, text=text)
         known = self.status()
         if known is not None and known.run != status.run and known.state in _UNDER_WAY:
             text = (
@@ -90,3 +96,15 @@ class SequenceBoard:
             severity: Severity = "warning" if now.state in {"failed", "stopped"} else "info"
             detail = f": {now.message}" if now.message else ""
             self._journal.event(severity, _SOURCE, f"{now.name} {now.state}{detail}")
+
+
+def _is_possible(status: SequenceStatus, now_s: float) -> bool:
+    """Whether a program's report can be logged and shown."""
+    counts, times_s = [status.steps, status.step_number, status.attempt], []
+    if (last := status.last_attempt) is not None:
+        counts += [last.step_number, last.attempt]
+        times_s = [last.time_s, last.began_s, last.ended_s]
+    # NaN is neither.
+    return all(0 <= count < MOST for count in counts) and all(
+        0 <= at_s <= now_s for at_s in times_s
+    )

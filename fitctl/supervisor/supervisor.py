@@ -36,7 +36,7 @@ from fitctl.loop.loop import Loop
 from fitctl.loop.metrology import MetrologyLoop, metrology_loop
 from fitctl.loop.overlap import OverlapMeter
 from fitctl.loop.stellar import StellarLoop, stellar_loop
-from fitctl.messages.command_table import ROWS, command_record
+from fitctl.messages.command_table import ROWS, command_record, why_too_old
 from fitctl.messages.commands import (
     Acquire,
     AnyCommand,
@@ -85,6 +85,8 @@ _COMMANDS: dict[type[AnyCommand], Trigger] = {
     Recover: Trigger.RECOVER,
     Off: Trigger.OFF,
 }
+GOES_TO_BIAS = "is on its way to its bias"
+"""In the answer to an `Off` that is refused, but moves a mirror."""
 _POWER_UP = {Trigger.STANDBY, Trigger.RECOVER}
 MakeLoop = Callable[[str, Rig, LoopDevices, Journal, Designer], Loop]
 
@@ -99,12 +101,13 @@ def loop_of_kind(
 
 
 class Posted(NamedTuple):
-    """A command on its way to the next step: whom it answers, and who gave it from where."""
+    """A command on its way to the next step: whom it answers, who gave it from where, since when it waits."""
 
     command: AnyCommand
     reply: Callable[[Reply], None]
     sender: str
     address: str
+    waits_since_s: float
 
 
 class Supervisor:
@@ -214,8 +217,11 @@ class Supervisor:
         reply: Callable[[Reply], None],
         sender: str = "",
         address: str = "",
+        waits_since_s: float = math.inf,
     ) -> None:
         """Leave a command for the next step; `reply` is called from there.
+
+        It is refused there if it may have waited too long since `waits_since_s`.
 
         A stop takes the velocity from the siderostats, and stops the hexapod, here and now; the rest follows
         at the next step.
@@ -224,7 +230,7 @@ class Supervisor:
             self._stop_collector()
             for name in self._named(command):
                 self.loops[name].servo.stop()
-        self._commands.append(Posted(command, reply, sender, address))
+        self._commands.append(Posted(command, reply, sender, address, waits_since_s))
         if self._closed:  # no step follows
             self._end_posted()
 
@@ -395,7 +401,9 @@ class Supervisor:
 
     def _obey_posted(self) -> None:
         for posted in self._taken():
-            self._answer(posted, self._obey(posted.command), self._record)
+            why_not = why_too_old(posted.command, posted.waits_since_s, self._clock.now_s())
+            reply = _refusal(why_not) if why_not else self._obey(posted.command)
+            self._answer(posted, reply, self._record)
 
     def _end_posted(self) -> None:
         """Answer what came after the end, on any thread: all is stopped already."""
@@ -489,7 +497,7 @@ class Supervisor:
             )
         moving = self._rest_mirrors(usable) if trigger is Trigger.OFF else []
         if moving:
-            return _refusal(f"mirror {', '.join(moving)} is on its way to its bias; try again")
+            return _refusal(f"mirror {', '.join(moving)} {GOES_TO_BIAS}; try again")
         reply = self._begin(command, usable)
         ended = partial(self.outcomes.end, reply.number, usable)
         if trigger in _POWER_UP:

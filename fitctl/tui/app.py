@@ -305,7 +305,8 @@ class ConsoleApp(App[None]):
             title = f"▲ {ROWS[type(command)].title} is not sent"
             self.notify(why_not, title=title, severity="warning", timeout=6, markup=False)
             return
-        loop = "" if isinstance(command, Stop | Shutdown) else self.state.shown
+        for_all = isinstance(command, Stop) or ROWS[type(command)].of_rig
+        loop = "" if for_all else self.state.shown
         self._wire.send(msgspec.structs.replace(command, loop=loop))
 
     @property

@@ -172,6 +172,10 @@ FOUND = {
         ),
         "a loop that waited goes on at its star",
     ),
+    "obeyed-late": (
+        plan(Stall(at_s=0.05, lasts_s=3.0, alone=True), gives(0.1, Standby())),
+        "a command whose sender has given up is not carried out",
+    ),
     "sequence-in-safe": (
         plan(
             Sequence(at_s=0.5, who="ada", steps=["standby", "beam_standby", "wait"], loop="right"),

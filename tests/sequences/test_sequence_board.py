@@ -1,6 +1,9 @@
 """Who may report a sequence, for how long, and what is made of it."""
 
+import math
+
 import msgspec
+import pytest
 
 from fitctl.clock import VirtualClock
 from fitctl.logging.records import Event, SequenceAttempt
@@ -77,6 +80,7 @@ def test_orders_stay_until_the_next_one_whatever_the_sequence_says():
 
 def test_each_attempt_is_recorded_once_and_beginning_and_end_are_events():
     board = Board()
+    board.after(1.0)
     board.report(FIRST)
     with_attempt = msgspec.structs.replace(FIRST, last_attempt=ATTEMPT)
     board.report(with_attempt)
@@ -86,3 +90,28 @@ def test_each_attempt_is_recorded_once_and_beginning_and_end_are_events():
     assert [record for record in board.records if not isinstance(record, Event)] == [ATTEMPT]
     events = [(e.severity, e.message) for e in board.records if isinstance(e, Event)]
     assert events == [("info", "first begins, 3 steps"), ("warning", "first failed: no star")]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"steps": -1},
+        {"step_number": 2**63},
+        {"last_attempt": msgspec.structs.replace(ATTEMPT, time_s=math.nan)},
+        {"last_attempt": msgspec.structs.replace(ATTEMPT, began_s=-1.0)},
+        {"last_attempt": msgspec.structs.replace(ATTEMPT, ended_s=1e300)},
+        {"last_attempt": msgspec.structs.replace(ATTEMPT, attempt=-3)},
+    ],
+)
+def test_a_report_with_numbers_that_cannot_be_is_refused_and_shown_to_nobody(wrong):
+    board = Board()
+    board.after(1.0)
+
+    reply = board.report(msgspec.structs.replace(FIRST, **wrong))
+
+    assert not reply.accepted
+    assert reply.text.startswith(
+        "sequence first: expected numbers of steps, and times between 0 and"
+    )
+    assert board.status() is None
+    assert board.records == []

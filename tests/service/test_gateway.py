@@ -1,5 +1,6 @@
 """The gateway between the network and the supervisor: what it passes on, for whom, and what only it may say."""
 
+import math
 import signal
 import socket
 import subprocess
@@ -17,6 +18,7 @@ from instruments.served import Served, rig_in, until
 from fitctl.clock import MonotonicClock, VirtualClock
 from fitctl.config import ConfigError
 from fitctl.logging.records import CommandRecord
+from fitctl.messages.client import Client
 from fitctl.messages.commands import Release, Status, Stop, TakeOver
 from fitctl.messages.endpoints import (
     GATEWAY_SOCKET,
@@ -30,7 +32,9 @@ from fitctl.service.gateway import Gateway
 from fitctl.service.keyed_door import check_keyed_door
 
 STOP = msgspec.msgpack.encode(Stop())
-OF_ANNA = Passed(name="anna", role="commander", address="10.0.0.1", payload=STOP)
+OF_ANNA = Passed(
+    name="anna", role="commander", address="10.0.0.1", payload=STOP, waits_since_s=math.inf
+)
 
 
 @pytest.fixture
@@ -173,6 +177,38 @@ def test_a_report_of_keys_takes_the_instrument_from_nobody_else(served, say):
     until(lambda: "the key anna was revoked or changed" in served.events())
     assert "one key" in served.events()
     assert served.follow(lambda t: "@" in t.commander)
+
+
+def test_what_came_while_the_gateway_stood_still_is_not_carried_out_but_a_stop_is(tmp_path):
+    """The clocks of both processes are one; the supervisor goes on meanwhile."""
+    clock = VirtualClock()
+    served = Served(tmp_path, tcp=True, clock=clock)
+    served.start()
+    served.stop_gateway()
+    served.start_gateway(clock)
+    try:
+        anna = served.person("anna")
+        assert anna.send(TakeOver()).accepted
+        until(lambda: served.gateway._intake.waits_since_s == clock.now_s())
+        served.service._intake.begin_round = lambda _now_s: None  # it does not stand still
+        clock.sleep_until(clock.now_s() + 4.2)
+        refused, stopped = anna.send(TakeOver()), anna.send(Stop())
+    finally:
+        served.close()
+
+    assert "TakeOver may have waited for 4.2 s" in refused.text
+    assert stopped.accepted
+
+
+def test_who_sends_to_a_gateway_without_a_supervisor_is_answered(gateway_in, tmp_path):
+    anna = Client(new_key(gateway_in, "anna", "commander", "", tmp_path / "anna.key.toml"))
+    try:
+        reply = anna.send(Status(), timeout_s=20.0)
+    finally:
+        anna.close()
+
+    assert not reply.accepted
+    assert reply.text == "the supervisor accepts no commands at the moment; try again"
 
 
 HANGING = """

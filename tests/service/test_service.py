@@ -17,10 +17,12 @@ from fitctl.messages.commands import (
     Experiment,
     RecentEvents,
     RecorderReport,
+    Recover,
     SetTarget,
     Standby,
     Status,
     Stop,
+    TakeOver,
 )
 from fitctl.messages.endpoints import make_service_folder, service_folder
 from fitctl.model.drives import Drive
@@ -278,3 +280,29 @@ def test_a_stop_is_never_one_too_many(slow_clock):
 
     assert all(reply.accepted for reply in stops)
     assert slow_clock.simulation.supervisor.loops["right"].mode.name == "SAFE"
+
+
+def test_what_came_while_the_supervisor_stood_still_is_not_carried_out_but_a_stop_is(tmp_path):
+    clock = VirtualClock()
+    served = Served(tmp_path, clock=clock)
+    served.start()
+    try:
+        assert served.client.send(TakeOver()).accepted
+        clock.sleep_until(clock.now_s() + 4.2)
+        refused, stopped = served.client.send(Standby()), served.client.send(Stop())
+        taken_over = served.client.send(TakeOver())
+        for _ in range(2):
+            clock.sleep_until(clock.now_s() + 0.3)
+            served.client.send(Status())
+        recovered = served.client.send(Recover())
+    finally:
+        served.close()
+
+    assert refused.text == (
+        "Standby may have waited for 4.2 s, because the supervisor or its gateway stood still; after 1.75 s "
+        "a command is not carried out: send it again"
+    )
+    assert stopped.accepted
+    assert "TakeOver may have waited for 4.2 s" in taken_over.text
+    assert recovered.accepted
+    assert [accepted for _, accepted in served.commands("Standby")] == [False]

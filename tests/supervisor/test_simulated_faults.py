@@ -236,6 +236,21 @@ def test_what_comes_after_the_instrument_is_closed_is_answered(vernier):
     ]
 
 
+def test_a_command_that_waits_for_a_step_longer_than_its_sender_is_refused_and_a_stop_is_not(
+    vernier,
+):
+    replies, since_s = [], vernier.clock.now_s()
+    vernier.supervisor.post(Release(), replies.append, waits_since_s=since_s - 1.9)
+    vernier.supervisor.step()
+
+    assert not replies[0].accepted
+    assert "Release may have waited for 1.9 s" in replies[0].text
+    assert mode_of(vernier) is Mode.VERNIER
+    vernier.supervisor.post(Stop(), replies.append, waits_since_s=since_s - 1.9)
+    vernier.supervisor.step()
+    assert mode_of(vernier) is Mode.SAFE
+
+
 def test_two_devices_that_fail_at_once_are_each_told_once(vernier, monkeypatch):
     silent = DeviceTimeout("piezo", "/dev/ttyUSB0", "an answer", "none")
     unplugged = DeviceUnreachable("camera", "127.0.0.1:3956", "an answer", "none")

@@ -16,7 +16,7 @@ from instruments.served import free_port
 
 from fitctl.config import load_rig
 from fitctl.messages.client import Client
-from fitctl.messages.commands import Status
+from fitctl.messages.commands import Status, TakeOver
 from fitctl.messages.endpoints import tcp_endpoint
 from fitctl.messages.keys import new_key
 from fitctl.processes import rig_arguments
@@ -109,6 +109,33 @@ def test_a_gateway_that_ends_is_told_of_and_clients_come_back_by_themselves(rig,
         pass
     assert rig.anna.receive(START_S).loops[0].mode == "OFF"
     assert rig.supervisor.poll() is None
+
+
+@pytest.mark.parametrize("who", ["supervisor", "gateway"])
+def test_a_command_that_was_reported_as_unanswered_is_not_carried_out_later(rig, who):
+    assert commander_now(rig) != "anna"
+    stood_still = psutil.Process(rig.supervisor.pid) if who == "supervisor" else gateway_of(rig)
+    stood_still.suspend()
+    try:
+        with pytest.raises(ConnectionError, match="no supervisor answers"):
+            rig.anna.send(TakeOver())
+    finally:
+        stood_still.resume()
+
+    assert commander_now(rig) != "anna"
+    end_s = time.monotonic() + START_S
+    while not (reply := rig.anna.send(TakeOver())).accepted:
+        assert "TakeOver may have waited for" in reply.text
+        assert time.monotonic() < end_s
+        time.sleep(0.1)
+    assert commander_now(rig) == "anna"
+    assert rig.client.send(TakeOver()).accepted
+
+
+def commander_now(rig):
+    """After all commands before this have been read."""
+    reply_s = answered(rig.anna).time_s
+    return rig.follow(lambda t: t.time_s >= reply_s)[-1].commander
 
 
 def test_heartbeats_by_an_allowed_key_are_the_gateways_affair_alone(rig):

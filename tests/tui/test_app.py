@@ -174,4 +174,4 @@ def test_taking_over_is_in_the_palette_and_its_answer_is_shown():
         command.callback()
         await until(pilot, lambda: "taken over from anna" in notifications(app))
 
-    assert run(scenario, link=FakeLink(lambda _: answer)).sent == [TakeOver(loop="right")]
+    assert run(scenario, link=FakeLink(lambda _: answer)).sent == [TakeOver()]
