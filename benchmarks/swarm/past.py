@@ -381,7 +381,7 @@ DEFECTS = {
         ],
     ),
     "obeyed-late": Defect(
-        "this commit",
+        "223a2238",
         "a command that waited for a supervisor that stood still is carried out, long after its sender gave up",
         [
             (module, "why_too_old", lambda _command, _since_s, _now_s: "")
