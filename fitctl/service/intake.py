@@ -22,8 +22,9 @@ _LOGGED_REFUSALS_PER_S = 1.0
 _LOGGED_REFUSALS_AT_ONCE = 10.0
 # Beside the rate of commands. Somebody who needs to stop needs one; reading a flood of them takes all the time.
 _STOPS_PER_S = 50.0
-_STANDSTILL_S = 1.0  # between two rounds; what a shorter one leaves unread is read in the next
-_CAUGHT_UP_S = 0.5  # after a standstill, until what came meanwhile has been read
+_STANDSTILL_S = 0.25  # between two rounds; a round comes every few milliseconds, at the gateway every 0.1 s
+_CAUGHT_UP_S = 0.5  # after a standstill, until what came meanwhile has been read; another one does not count
+_OF_A_ROUND_S = 0.1  # counts all the same, so that who stands still again and again accepts something
 
 
 class Accepted(NamedTuple):
@@ -83,9 +84,12 @@ class Intake:
 
     def begin_round(self, now_s: float) -> None:
         """Messages are read from now on; the process may have stood still since the round before."""
-        if now_s - self._round_s > _STANDSTILL_S:
+        stood_s = now_s - self._round_s
+        if stood_s > _STANDSTILL_S and self._round_s > self._caught_up_s:
             self.waits_since_s = self._round_s
             self._caught_up_s = now_s + _CAUGHT_UP_S
+        elif stood_s > _STANDSTILL_S:
+            self._caught_up_s += stood_s - _OF_A_ROUND_S
         elif now_s > self._caught_up_s:
             self.waits_since_s = min(self._round_s, now_s)
         self._round_s = now_s

@@ -291,8 +291,8 @@ def test_what_came_while_the_supervisor_stood_still_is_not_carried_out_but_a_sto
         clock.sleep_until(clock.now_s() + 4.2)
         refused, stopped = served.client.send(Standby()), served.client.send(Stop())
         taken_over = served.client.send(TakeOver())
-        for _ in range(2):
-            clock.sleep_until(clock.now_s() + 0.3)
+        for _ in range(3):
+            clock.sleep_until(clock.now_s() + 0.2)
             served.client.send(Status())
         recovered = served.client.send(Recover())
     finally:
