@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import socket
 import time
 from collections import deque
 from collections.abc import Callable
@@ -232,6 +233,19 @@ class Client:
             f"no supervisor answers at {place} within {timeout_s:g} s; see that rig {where.rig} runs with "
             "service.tcp_address, and that nothing between blocks its ports"
         )
+
+    def nobody_listens(self) -> bool:
+        """Whether a supervisor on another machine has left its port; False if that machine does not answer."""
+        where = self._where
+        if not isinstance(where, RemoteKey):
+            return False
+        try:
+            with socket.create_connection((where.host, where.command_port), _REFUSED_TIMEOUT_S):
+                return False
+        except ConnectionRefusedError:
+            return True
+        except OSError:
+            return False
 
     def _is_refused(self) -> bool:
         """Whether there is a server that ends the handshake."""

@@ -12,7 +12,6 @@ from fitctl.messages.telemetry import CommandOutcome, Telemetry
 
 RECEIVE_S = 0.5
 SILENCE_S = 5.0
-_GONE_S = 2.0  # silence of a supervisor that was told to end
 
 
 class Link(Protocol):
@@ -74,13 +73,28 @@ def _of_number(telemetry: Telemetry, number: int) -> dict[str, CommandOutcome]:
 def wait_for_end(client: Client, timeout_s: float) -> bool:
     """Wait until a supervisor that was told to end has ended; whether it has, after `timeout_s` at the latest.
 
-    On this machine, its locks are free, so that another can start; a supervisor elsewhere has sent no telemetry
-    for 2 s.
+    On this machine, its locks are free, so that another can start; elsewhere, it sends no telemetry and nobody
+    listens at its port, or another one sends telemetry.
+
+    Raises
+    ------
+    ConnectionError
+        If one elsewhere is silent in the end, and its machine does not say that nobody listens.
     """
     end_s = time.monotonic() + timeout_s
+    folder, pid = client.folder, 0
     while True:
-        silent = client.receive(RECEIVE_S if client.folder else _GONE_S) is None
-        if silent and (client.folder is None or not supervisor_runs(client.folder)):
+        telemetry = client.receive(RECEIVE_S)
+        if telemetry is None:
+            gone = client.nobody_listens() if folder is None else not supervisor_runs(folder)
+        else:
+            gone = folder is None and pid not in {0, telemetry.pid}
+            pid = pid or telemetry.pid
+        if gone:
             return True
-        if time.monotonic() >= end_s:
-            return False
+        if time.monotonic() < end_s:
+            continue
+        if telemetry is None and folder is None:
+            msg = f"whether the supervisor has ended is not known: {client.why_silent(timeout_s)}"
+            raise ConnectionError(msg)
+        return False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 import tempfile
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -65,13 +66,16 @@ _MOST_PERIODS = 1e6  # of a servo between two reports, which come every second; 
 _AT_THE_END = {DeviceHealth, LoopTiming, Overlap, RecorderStatus}
 _TICKS = {Tick, MetrologyTick}
 KINDS: set[Any] = _BEGIN | _BEFORE_TICK | _AT_THE_END | _TICKS | {FrameRecord}
-_TIMES = ("time_s", "mid_exposure_s", "compute_s", "requested_s")  # of ticks
+_MOTORS = ("siderostat_az_rad", "siderostat_el_rad")
 _STACKS = ("stack1_v", "stack2_v", "stack3_v")
-# Fields that must be numbers in which one can count, of what is no tick.
-_NUMBERS = {
-    kind: [name for name, field_type in get_type_hints(kind).items() if field_type is float]
-    for kind in (StarPlace, BeamPlace)
-} | {LoopTiming: ["servo_periods"]}
+# By kind and field, what a number is less than.
+_MOST = {
+    kind: {name: MOST for name, field_type in get_type_hints(kind).items() if field_type is float}
+    for kind in KINDS
+}
+_MOST[LoopTiming]["servo_periods"] = _MOST_PERIODS
+for _name in ("noise_az_arcsec", "noise_el_arcsec"):  # infinite without light
+    del _MOST[MetrologyTick][_name]
 # The newest field that a replay needs of each kind of tick, and what a log without it lacks.
 _NEEDED = {
     Tick: ("fsm_written_s", "have neither commands nor when voltages took effect"),
@@ -154,11 +158,13 @@ class LoggedStep:
 def whole_run(paths: Sequence[Path]) -> Iterator[LogInfo]:
     """One log of a run out of the files that it was rotated into, or cut in by a crash.
 
+    Several files are copied into one, in the folder for temporary files.
+
     Raises
     ------
     LogError
-        If a file cannot be read or is damaged, they are of several runs, or what they hold does not begin
-        where the run did.
+        If a file cannot be read or is damaged, they are of several runs, what they hold does not begin
+        where the run did, or there is no room for the copy.
     """
     runs = {log.path: log.metadata.get("clock", {}) for log in logs_of_one_run_each(paths)}
     first = runs[paths[0]]
@@ -170,6 +176,13 @@ def whole_run(paths: Sequence[Path]) -> Iterator[LogInfo]:
         yield log_info(paths[0])
         return
     with tempfile.TemporaryDirectory(prefix="fitctl-replay-") as folder:
+        needed, free = sum(path.stat().st_size for path in paths), shutil.disk_usage(folder).free
+        if free < needed:
+            msg = (
+                f"{Path(folder).parent}: has {free / 1e6:.0f} MB free, expected {needed / 1e6:.0f} MB for "
+                f"a copy of the run's {len(paths)} files as one; make room, or set TMPDIR to another folder"
+            )
+            raise LogError(msg)
         together = Path(folder) / paths[0].name
         merge(paths, together)
         try:
@@ -272,15 +285,10 @@ def _is_over(step: LoggedStep, record: Logged, powered: bool) -> bool:
 
 
 def _insist_on_numbers(info: LogInfo, topic: str, kind: Any, message: Any, rig: Rig) -> None:
-    """Refuse times that cannot be counted from, outputs that no D/A has, places and counts that are none."""
-    most = _MOST_PERIODS if kind is LoopTiming else MOST
-    names: Sequence[str] = _TIMES if kind in _TICKS else _NUMBERS.get(kind, ())
-    has_outputs = kind is DevicesOpened and not message.error and message.loop in rig.stellar_loops
-    if has_outputs:
-        names = _STACKS
-    for name in names:
+    """Refuse numbers that no instrument has, and NaN where fitctl records a number."""
+    for name, most in _MOST[kind].items():
         value = getattr(message, name, 0.0)
-        if abs(value) >= most or (math.isnan(value) and not _was_not(kind, message, name)):
+        if abs(value) >= most or (math.isnan(value) and _must_be(kind, message, name, rig)):
             msg = (
                 f"{info.path}: {topic} is not as fitctl records it: {name} is {value:g}; name a log that "
                 "fitctl recorded"
@@ -288,11 +296,15 @@ def _insist_on_numbers(info: LogInfo, topic: str, kind: Any, message: Any, rig: 
             raise LogError(msg)
 
 
-def _was_not(kind: Any, message: Any, name: str) -> bool:
-    """Whether NaN stands for a time that there was not: that of a tick's frame, if it had none, or sample."""
-    if name == "mid_exposure_s":
-        return bool(message.number < 0)
-    return kind in _TICKS and name != "time_s"
+def _must_be(kind: Any, message: Any, name: str, rig: Rig) -> bool:
+    """Whether fitctl records a number here whatever happens; NaN stands for what there was not."""
+    if kind is DevicesOpened:
+        return name in _STACKS and not message.error and message.loop in rig.stellar_loops
+    if kind in _TICKS and name == "mid_exposure_s":
+        return bool(message.number >= 0)
+    if kind in _TICKS and name in _MOTORS:
+        return bool(message.mode_number != Mode.OFF)
+    return name == "time_s" or kind in {StarPlace, BeamPlace}
 
 
 def _insist_on_field(info: LogInfo, tick: Any, field_name: str, lacks: str) -> None:

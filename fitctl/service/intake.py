@@ -22,9 +22,15 @@ _LOGGED_REFUSALS_PER_S = 1.0
 _LOGGED_REFUSALS_AT_ONCE = 10.0
 # Beside the rate of commands. Somebody who needs to stop needs one; reading a flood of them takes all the time.
 _STOPS_PER_S = 50.0
-_STANDSTILL_S = 0.25  # between two rounds; a round comes every few milliseconds, at the gateway every 0.1 s
-_CAUGHT_UP_S = 0.5  # after a standstill, until what came meanwhile has been read; another one does not count
-_OF_A_ROUND_S = 0.1  # counts all the same, so that who stands still again and again accepts something
+_STANDSTILL_S = (
+    0.25  # between two rounds; a round comes every few milliseconds, at the gateway every 0.1 s
+)
+_CAUGHT_UP_S = (
+    0.5  # after a standstill, until what came meanwhile has been read; another one does not count
+)
+_OF_A_ROUND_S = (
+    0.1  # counts all the same, so that who stands still again and again accepts something
+)
 
 
 class Accepted(NamedTuple):

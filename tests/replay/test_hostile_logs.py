@@ -23,10 +23,19 @@ from fitctl.logging import schemas
 from fitctl.logging.errors import LogError
 from fitctl.logging.exporting import export
 from fitctl.logging.reading import log_info
-from fitctl.logging.records import ControllerChange, DevicesOpened, Event, LoopTiming, Tick
+from fitctl.logging.records import (
+    ControllerChange,
+    DevicesOpened,
+    Event,
+    LoopTiming,
+    ModeChange,
+    OutputsFound,
+    Tick,
+)
 from fitctl.logging.schemas import MESSAGES
 from fitctl.messages.command_table import command_record
 from fitctl.messages.commands import Reply, SetController
+from fitctl.messages.modes import Mode
 from fitctl.replay.devices import logged_error
 from fitctl.replay.log import Logged, LoggedStep, read_steps
 from fitctl.replay.replay import Replay
@@ -224,6 +233,38 @@ def test_outputs_that_no_d_a_has_are_refused(tmp_path, value):
     path = write_log(tmp_path / "a.mcap", [RUN_INFO, opened, tick(1), frame(1)])
 
     with pytest.raises(LogError, match=r"a\.mcap: .* is not as fitctl records it: stack2_v is "):
+        list(read_steps(log_info(path), load_rig(default_rig_path())))
+
+
+@pytest.mark.parametrize(
+    ("record", "name"),
+    [
+        (tick(1), "fsm_az_rad"),
+        (tick(1), "star_el_px"),
+        (tick(1), "stack3_v"),
+        (filled(ModeChange, loop="right"), "siderostat_az_rad"),
+        (filled(OutputsFound, loop="right"), "stack1_v"),
+    ],
+)
+def test_numbers_that_no_device_has_are_refused(tmp_path, record, name):
+    wrong = msgspec.structs.replace(record, **{name: 1e300})
+    path = write_log(tmp_path / "a.mcap", [RUN_INFO, wrong, tick(2), frame(2)])
+
+    with pytest.raises(
+        LogError, match=rf"a\.mcap: .* is not as fitctl records it: {name} is 1e\+300"
+    ):
+        list(read_steps(log_info(path), load_rig(default_rig_path())))
+
+
+@pytest.mark.parametrize("name", ["siderostat_az_rad", "siderostat_el_rad"])
+def test_motors_that_are_nowhere_while_the_loop_is_not_off_are_refused(tmp_path, name):
+    opened = filled(DevicesOpened, loop="right", error="")
+    standby = {"mode": "STANDBY", "mode_number": int(Mode.STANDBY)}
+    path = write_log(
+        tmp_path / "a.mcap", [RUN_INFO, opened, tick(1, **standby, **{name: math.nan}), frame(1)]
+    )
+
+    with pytest.raises(LogError, match=rf"a\.mcap: .* is not as fitctl records it: {name} is nan"):
         list(read_steps(log_info(path), load_rig(default_rig_path())))
 
 

@@ -9,7 +9,16 @@ from samples.replay_courses import COURSES, hold_a_star, replayed, two_loops
 from fitctl.config import default_rig_path, load_rig
 from fitctl.controllers.design.choose import design_for
 from fitctl.logging.records import ControllerChange, ModeChange
-from fitctl.messages.commands import Acquire, Standby, Stop
+from fitctl.messages.command_table import command_record
+from fitctl.messages.commands import (
+    Acquire,
+    Off,
+    Release,
+    Reply,
+    SetBiasOffset,
+    Standby,
+    Stop,
+)
 from fitctl.replay.devices import LoggedExecutor
 
 QUICK = {
@@ -39,6 +48,24 @@ def test_a_run_replayed_is_the_same_to_the_last_bit(logged, course, overrides, h
     loop = result.loops["right"]
     assert loop.ticks == sum(tick.number >= 0 or tick.mode != "OFF" for tick in simulation.ticks)
     assert all(found.compared >= 2 * loop.ticks for found in loop.differences.values())
+
+
+def test_an_off_that_was_refused_moves_the_mirror_only_if_that_is_the_reason(logged):
+    def course(simulation):
+        hold_a_star(simulation)
+        simulation.command(Release())
+        simulation.command(SetBiasOffset(az_urad=100.0, el_urad=0.0))
+        simulation.run(1.0)
+        refused = Reply(accepted=False, text="ada has the instrument")
+        simulation.log(command_record(Off(), refused, "ben", "", simulation.clock.now_s()))
+        simulation.run(0.5)
+        assert "is on its way to its bias" in simulation.command(Off()).text
+        simulation.run(0.5)
+
+    path, _ = logged(course)
+    result = replayed(path)
+
+    assert result.same, result
 
 
 @pytest.mark.long

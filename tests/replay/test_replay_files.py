@@ -1,5 +1,7 @@
 """Which files can be replayed, and what is said of those that cannot."""
 
+import shutil
+
 import msgspec
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from fitctl.logging.copying import cut
 from fitctl.logging.errors import LogError
 from fitctl.logging.reading import log_info
 from fitctl.logging.records import Tick
-from fitctl.messages.commands import SetTarget, Stop
+from fitctl.messages.commands import SetTarget, Standby, Stop
 from tests.samples.logged_simulation import WALL_S, LoggedSimulation
 
 
@@ -142,3 +144,21 @@ def test_a_log_of_an_older_fitctl_is_refused_and_says_what_it_lacks(held_log, mo
     assert log_info(path).counts["/fit/right/tick"] > 100
     with pytest.raises(LogError, match=r"older fitctl .* neither commands nor when voltages"):
         replayed(path)
+
+
+def test_a_copy_of_several_files_needs_room(logged, tmp_path, monkeypatch):
+    second = tmp_path / "second.mcap"
+
+    def course(simulation):
+        simulation.command(Standby())
+        simulation.go_on_in(second)
+        simulation.run(0.1)
+
+    first, _ = logged(course)
+    usage = shutil.disk_usage(tmp_path)._replace(free=1000)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage)
+
+    with pytest.raises(
+        LogError, match=r"has 0 MB free, .* 2 files as one; .* set TMPDIR to another"
+    ):
+        replayed(first, second)

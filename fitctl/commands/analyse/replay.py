@@ -25,6 +25,7 @@ from fitctl.learn.advice import standing
 from fitctl.learn.design_basis import estimated
 from fitctl.logging.reading import LogInfo, clock_of
 from fitctl.logging.schemas import designs_of
+from fitctl.processes import ended_by_signals, interrupt
 from fitctl.replay.files import logged_files, missing_dark_file
 from fitctl.replay.log import read_steps, whole_run
 from fitctl.replay.replay import replay as replay_steps
@@ -79,7 +80,8 @@ def replay(
             msg = f"replay: --set {override}: a replay uses nothing of the table {table}; leave it out"
             raise ConfigError(msg)
     logs = chosen_logs("replay", logs, rig, latest=latest)
-    with whole_run(logs) as info, logged_files(info) as files:
+    # Its copies of files would outlive it.
+    with ended_by_signals(interrupt), whole_run(logs) as info, logged_files(info) as files:
         settings = _rig(info, files, rig, overrides or [], controller)
         dark_file = None if rig else missing_dark_file(info, settings)
         if dark_file is not None:
@@ -114,6 +116,12 @@ def _replayed(info: LogInfo, rig: Rig, *, keep_controllers: bool) -> ReplayResul
             rig, read_steps(info, rig), on_tick=progress, keep_controllers=keep_controllers
         )
         progress(info.duration_s)
+    if not any(loop.ticks for loop in result.loops.values()):
+        msg = (
+            f"{info.path}: has no complete tick of a loop, so nothing was replayed; expected one at least: "
+            "name a longer log"
+        )
+        raise ConfigError(msg)
     return result
 
 

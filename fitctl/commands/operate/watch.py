@@ -25,7 +25,6 @@ from fitctl.processes import ended_by_signals, interrupt
 
 _LINE_S = 1.0
 _POLL_S = 0.2
-_SILENCE = "no telemetry from a supervisor; if none is running, start one: fitctl run"
 
 
 class LoopSecond(msgspec.Struct, frozen=True, kw_only=True):
@@ -92,8 +91,11 @@ def watch(
     """Print a line a second, and every event."""
     client = connect("watch", rig, overrides, remote)
 
-    def why_silent() -> str:  # for a remote client, asking takes a second
-        return _SILENCE if client.folder is None else client.why_silent(_LINE_S)
+    def why_silent() -> str:
+        if remote is None:
+            return client.why_silent(_LINE_S)
+        # For a remote client, asking takes a second.
+        return f"no telemetry comes; to find out why: fitctl status --remote {remote}"
 
     text = to_json if as_json else _text
     received = False
@@ -115,7 +117,7 @@ def watch(
 def entries(
     receive: Callable[[float], Telemetry | None],
     duration_s: float | None,
-    why_silent: Callable[[], str] = lambda: _SILENCE,
+    why_silent: Callable[[], str],
 ) -> Iterator[Entry]:
     """What `receive` brings, a second at a time, and every event as it comes; silence once a second.
 

@@ -55,9 +55,6 @@ def _messages(client: Client) -> list[Telemetry]:
         if all(loop.name in ticked or loop.mode == "OFF" for loop in message.loops):
             break
     if not messages:
-        msg = (
-            f"no telemetry within {LISTEN_S:g} s, so the present state is not known; start a supervisor with "
-            "fitctl run"
-        )
+        msg = f"the present state is not known: {client.why_silent(LISTEN_S)}"
         raise ConnectionError(msg)
     return messages

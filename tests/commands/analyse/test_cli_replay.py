@@ -1,11 +1,16 @@
 """`fitctl replay` as a stranger meets it."""
 
 import json
+import os
+import signal
+import subprocess
+import sys
 
 import msgspec
 import numpy as np
 import pytest
-from samples.log_samples import RUN_INFO, tick, write_log
+from instruments.served import until
+from samples.log_samples import RUN_INFO, frame, tick, write_log
 
 from fitctl.cli import main
 from fitctl.config import default_rig_path, load_rig
@@ -212,3 +217,44 @@ def test_a_log_whose_rig_is_none_is_refused_with_a_rig_file_too(replay, tmp_path
     assert status == 2
     assert f"the rig in {path}: is not as fitctl records it" in error
     assert len(error.splitlines()) == 1
+
+
+def test_a_log_of_no_complete_tick_is_not_called_the_same(replay, tmp_path):
+    rig = load_rig(default_rig_path())
+    info = msgspec.structs.replace(RUN_INFO, rig_json=rig.model_dump_json(), dark_npy=None)
+    # The tick on frame 2 comes first; without that frame the log is torn there.
+    path = write_log(
+        tmp_path / "torn.mcap", [info, frame(1), tick(2, time_s=1.0, mode="OFF", mode_number=0)]
+    )
+
+    status, text, error = replay(path)
+
+    assert (status, text) == (2, "")
+    assert f"{path}: has no complete tick of a loop, so nothing was replayed; expected one" in error
+
+
+@pytest.mark.parametrize("by", [signal.SIGTERM, signal.SIGHUP])
+def test_a_replay_that_is_ended_leaves_no_copy_of_its_files(tmp_path, by):
+    parts = [tmp_path / "first.mcap", tmp_path / "second.mcap"]
+    simulation = LoggedSimulation(load_rig(default_rig_path()), parts[0])
+    simulation.acquire()
+    simulation.go_on_in(parts[1])
+    simulation.run(60.0)
+    simulation.writer.close()
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "fitctl", "replay", *map(str, parts)],
+        env=os.environ | {"TMPDIR": str(folder)},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    until(lambda: list(folder.glob("fitctl-replay-*/*")))
+
+    process.send_signal(by)
+    _, error = process.communicate(timeout=60)
+
+    assert process.returncode == 130, error
+    assert "Traceback" not in error
+    assert list(folder.iterdir()) == []

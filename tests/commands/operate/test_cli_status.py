@@ -234,7 +234,7 @@ def watched(monkeypatch, arrivals, duration_s=None, silent_s=0.0):
             raise message
         return message
 
-    made = watch.entries(receive, duration_s)
+    made = watch.entries(receive, duration_s, lambda: "no telemetry; see fitctl run")
     try:
         yield from made
     except RuntimeError:  # the arrivals are over
