@@ -328,7 +328,9 @@ class StellarLoop(Loop):
         if self.mode is Mode.ACQUISITION:
             others = {
                 other.name: OtherStages(
-                    other._stages_px_at(frame.mid_exposure_s), follow=other.mode in FOLLOWING
+                    other._stages_px_at(frame.mid_exposure_s),
+                    follow=other.mode in FOLLOWING,
+                    lost=other.observation.star is None and not other.waits_for,
                 )
                 for other in self.others
             }

@@ -39,6 +39,7 @@ from fitctl.simulation.statistics import (
     SimulationResult,
     mode_times,
     motion_start_s,
+    of_enough,
     pair,
     piston_rms_m,
     rms,
@@ -291,7 +292,7 @@ def _metrology_result(simulation: Simulation, name: str, speed_x: float) -> Metr
     start_s, end_s = _counted_from_s(simulation, name), simulation.clock.now_s()
     beam_m = part.history_offset_m(start_s, end_s)[:, 0] if start_s < end_s else np.empty((0, 2))
     beam_arcsec = beam_m / part.sensor.link_length_m * ARCSEC_PER_RAD
-    return MetrologyResult(
+    result = MetrologyResult(
         acquired_s=_reached_s(simulation, name, Mode.COARSE),
         locked_s=_reached_s(simulation, name, Mode.LOCKED),
         rms_arcsec=pair(rms(beam_arcsec)),
@@ -304,6 +305,7 @@ def _metrology_result(simulation: Simulation, name: str, speed_x: float) -> Metr
         samples=simulation.samples[name],
         speed_x=speed_x,
     )
+    return of_enough(result)
 
 
 def _visibility(simulation: Simulation) -> float:
@@ -333,7 +335,7 @@ def _result(simulation: Simulation, name: str, speed_x: float) -> SimulationResu
         simulation.plants[name], simulation.supervisor.stellar_loops[name].target_px, start_s, end_s
     )
     measured = np.array([[t.error_az_px, t.error_el_px] for t in judged]).reshape(-1, 2)
-    return SimulationResult(
+    result = SimulationResult(
         acquired_s=_reached_s(simulation, name, Mode.COARSE),
         vernier_s=_reached_s(simulation, name, Mode.VERNIER),
         rms_px=pair(true_px),
@@ -344,3 +346,4 @@ def _result(simulation: Simulation, name: str, speed_x: float) -> SimulationResu
         frames=sum(tick.number >= 0 for tick in ticks),
         speed_x=speed_x,
     )
+    return of_enough(result)

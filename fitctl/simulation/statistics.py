@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +15,13 @@ from fitctl.messages.modes import STELLAR_MODES, Mode
 from fitctl.model.stellar_part import StellarPart
 
 Floats = NDArray[np.float64]
+LEAST_S = 1.0  # of a residual; less says little about its RMS
 SETTLE_S = 10.0  # after vernier is reached, before its residual counts
 TILT_EVERY = 10  # steps of the plant from one sample of the visibility to the next: 5 ms
 
 
 class SimulationResult(NamedTuple):
-    """What a simulated run gave; RMS about the target over `judged_s`, nan if that is empty.
+    """What a simulated run gave; RMS about the target over `judged_s`, nan if that is 0.
 
     The piston's RMS is about its mean: what path-length control has to follow.
     """
@@ -60,6 +61,21 @@ class RigResult(NamedTuple):
     loops: dict[str, SimulationResult | MetrologyResult]
     visibility: float
     speed_x: float
+
+
+AnyResult = TypeVar("AnyResult", SimulationResult, MetrologyResult)
+
+
+def of_enough(result: AnyResult) -> AnyResult:
+    """A loop's result, without an RMS if it held its star or its beam for less than `LEAST_S` once settled."""
+    if result.judged_s >= LEAST_S:
+        return result
+    nothing = pair(np.full(2, math.nan))
+    if isinstance(result, MetrologyResult):
+        return result._replace(rms_arcsec=nothing, judged_s=0.0)
+    return result._replace(
+        rms_px=nothing, measured_rms_px=nothing, piston_rms_m=math.nan, judged_s=0.0
+    )
 
 
 def motion_start_s(rig: Rig) -> float:

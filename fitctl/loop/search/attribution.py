@@ -32,6 +32,7 @@ class OtherStages(NamedTuple):
 
     moved_px: AzEl  # how far they, and a link's siderostat, move its star
     follow: bool  # its loop follows that star, which is then no candidate here
+    lost: bool  # its loop does not find that star on the newest frame
 
 
 class Attribution:
@@ -117,15 +118,16 @@ class Attribution:
         """What the second look shows, where the candidate is expected now, was moved by the own stages alone.
 
         It has left the candidate's place, and is not where it would be if it were the star of another loop that
-        does not follow it: a jog or a link may take that one to where the own one is expected.
+        does not follow it: a jog or a link may take that one to where the own one is expected. Nor has a loop
+        that follows its star just lost it: a gust may have taken that one there.
         """
-        if self.candidate is None:
+        if self.candidate is None or any(other.follow and other.lost for other in others.values()):
             return False
         az_px, el_px, *_ = self.candidate
         places_px = [(az_px, el_px)]
-        for name, (now_px, follow) in others.items():
-            then_px = self._others[name].moved_px
-            if not follow:
+        for name, other in others.items():
+            now_px, then_px = other.moved_px, self._others[name].moved_px
+            if not other.follow:
                 places_px.append((az_px + now_px[0] - then_px[0], el_px + now_px[1] - then_px[1]))
         return not any(is_within(*star[:2], *place_px, HALF_WINDOW_PX) for place_px in places_px)
 

@@ -44,6 +44,7 @@ from fitctl.simulation.statistics import (
     MetrologyResult,
     RigResult,
     SimulationResult,
+    of_enough,
     pair,
 )
 
@@ -293,7 +294,7 @@ class Batch:
         length_m = truth.metrology_loops[name].sensor.link_length_m
         rms_m = np.sqrt(_mean(state["true_sum2"], state["residual_steps"]))
         judged_s = float(state["now_s"] - state["residual_from_s"])
-        return MetrologyResult(
+        result = MetrologyResult(
             acquired_s=float(state["acquired_s"]),
             locked_s=float(state["held_s"]),
             rms_arcsec=pair(rms_m / length_m * ARCSEC_PER_RAD),
@@ -302,6 +303,7 @@ class Batch:
             samples=int(state["samples"]),
             speed_x=math.nan,
         )
+        return of_enough(result)
 
 
 def _begin(r: np.void) -> None:
@@ -315,7 +317,7 @@ def _stellar_result(state: np.void) -> SimulationResult:
     piston_m = _mean(state["piston_sum_m"], steps)
     piston_m2 = _mean(state["piston_sum_m2"], steps) - piston_m**2
     judged_s = float(state["now_s"] - state["residual_from_s"])
-    return SimulationResult(
+    result = SimulationResult(
         acquired_s=float(state["acquired_s"]),
         vernier_s=float(state["held_s"]),
         rms_px=pair(np.sqrt(_mean(state["true_sum2"], steps))),
@@ -326,6 +328,7 @@ def _stellar_result(state: np.void) -> SimulationResult:
         frames=int(state["frames"]),
         speed_x=math.nan,
     )
+    return of_enough(result)
 
 
 def _mean(total: Floats, count: int) -> Floats:

@@ -282,13 +282,19 @@ def propose(s: Any, r: Any) -> tuple[float, float]:
 
 
 @compilable()
-def has_moved(s: Any, r: Any) -> bool:
+def has_moved(ss: Any, rr: Any, i: int) -> bool:
     """``Attribution.has_moved``; True where no other loop's star is on the frame.
 
     In a batch, no loop is at rest and jogged while another searches.
     """
-    if not s.shared:
+    r = rr.stars[i]
+    if not ss.stars[i].shared:
         return True
+    for j in range(len(rr.stars)):
+        other = rr.stars[j]
+        follows = j != i and other.mode in (COARSE, VERNIER) and not other.waits
+        if follows and not other.star_visible:
+            return False
     place_px = r.candidate_px
     return not is_within(r.star_px[0], r.star_px[1], place_px[0], place_px[1], HALF_WINDOW_PX)
 
@@ -313,7 +319,7 @@ def evaluate_search(ss: Any, rr: Any, i: int, exposed_s: float) -> bool:
     if math.isnan(r.search_since_s):
         r.search_since_s = exposed_s
     if r.has_candidate:
-        shows = r.star_visible == 1 and has_moved(s, r)
+        shows = r.star_visible == 1 and has_moved(ss, rr, i)
         outcome = look_again(s.acquisition, r.candidate, shows, exposed_s)
         if outcome == CONFIRMED:
             fire(ss, rr, i, STAR_FOUND)
