@@ -9,7 +9,6 @@ next, so that commands meet it in every mode.
 
 from __future__ import annotations
 
-import math
 import os
 import tempfile
 from pathlib import Path
@@ -108,11 +107,8 @@ _COMMANDS = [
 _ENVELOPES = [
     msgspec.msgpack.encode(envelope)
     for envelope in (
-        *(
-            Passed(name="anna", role="commander", address="", payload=one, waits_since_s=math.inf)
-            for one in _COMMANDS
-        ),
-        Passed(name="bob", role="viewer", address="", payload=_COMMANDS[0], waits_since_s=math.inf),
+        *(Passed(name="anna", role="commander", address="", payload=one) for one in _COMMANDS),
+        Passed(name="bob", role="viewer", address="", payload=_COMMANDS[0]),
         Report(keys=[key for key in _KEYS if key], events=[("info", "listening")]),
         Report(keys=[], events=[]),
     )
@@ -170,7 +166,7 @@ def TestOneInput(data: bytes) -> None:  # noqa: N802 - atheris wants this name
         _SERVICE._open(b"gateway", b"route", payload)
         role, replies = (envelope.role, 1) if isinstance(envelope, Passed) else ("", 0)
     elif isinstance(sender, Sender):
-        _SERVICE._receive(Waiting(door, b"identity", b"tag", sender), payload, math.inf)
+        _SERVICE._receive(Waiting(door, b"identity", b"tag", sender), payload)
         role, replies = sender.role, 1
     else:
         _through_the_gateway(sender, payload, door)

@@ -61,9 +61,8 @@ def _post_waits(
     reply: Callable[[Reply], None],
     sender: str = "",
     address: str = "",
-    waits_since_s: float = math.inf,
 ) -> None:
-    self._commands.append(Posted(command, reply, sender, address, waits_since_s))
+    self._commands.append(Posted(command, reply, sender, address))
 
 
 def _ask_while_dac_ready(self: PiezoWatch) -> None:
@@ -382,11 +381,8 @@ DEFECTS = {
     ),
     "obeyed-late": Defect(
         "223a2238",
-        "a command that waited for a supervisor that stood still is carried out, long after its sender gave up",
-        [
-            (module, "why_too_old", lambda _command, _since_s, _now_s: "")
-            for module in (service, supervisor)
-        ],
+        "a command that waited for a supervisor that stood still is carried out long after it was sent",
+        [(module, "why_too_late", lambda _command, _now_s: "") for module in (service, supervisor)],
     ),
     "sequence-in-safe": Defect(
         "9802f29",

@@ -35,14 +35,13 @@ from fitctl.logging.records import (
     Tick,
 )
 from fitctl.messages.client import REPLY_TIMEOUT_S
-from fitctl.messages.command_table import ROWS
+from fitctl.messages.command_table import may_be_too_late
 from fitctl.messages.commands import (
     AnyCommand,
     RecentEvents,
     RecorderReport,
     Reply,
     Status,
-    Stop,
     TakeOver,
 )
 from fitctl.messages.telemetry import Telemetry
@@ -245,14 +244,10 @@ class SwarmService(Service):
         post = supervisor.post
 
         def watched_post(
-            command: AnyCommand,
-            reply: Callable[[Reply], None],
-            sender: str,
-            address: str,
-            waits_since_s: float,
+            command: AnyCommand, reply: Callable[[Reply], None], sender: str, address: str
         ) -> None:
             invariants.obeyed(command, sender)
-            post(command, reply, sender, address, waits_since_s)
+            post(command, reply, sender, address)
 
         supervisor.post = watched_post  # pyrefly: ignore[bad-assignment]
         self._admission = _WatchedAdmission(supervisor.rig.service.lease_s, invariants)
@@ -288,6 +283,7 @@ class SwarmService(Service):
         awake_s = self._time.awake_s()
         if not self._ended.wait(_ENDS_S) and self._time.awake_s() - awake_s >= _ENDS_S:
             self._invariants.violated("a service that is stopped ends", f"not in {_ENDS_S:g} s")
+        self._supervisor.record_left()
 
     def run(self) -> None:
         """Serve; this is the thread."""
@@ -301,6 +297,8 @@ class SwarmService(Service):
         if self._random.random() < _GARBAGE:
             size = self._random.randint(0, _MOST_GARBAGE_BYTES)
             self._pass(sender, None, self._random.randbytes(size), self._refused)
+        if may_be_too_late(command):
+            command = msgspec.structs.replace(command, sent_s=self._time.now_s())
         self._pass(sender, command, self._encode(command), reply)
 
     def _refused(self, reply: Reply) -> None:
@@ -321,13 +319,7 @@ class SwarmService(Service):
         door = self._local if sender.is_local else self._gateway
         if not sender.is_local:
             payload = self._encode(
-                Passed(
-                    name=sender.name,
-                    role=sender.role,
-                    address=sender.address,
-                    payload=payload,
-                    waits_since_s=at_s,
-                )
+                Passed(name=sender.name, role=sender.role, address=sender.address, payload=payload)
             )
         router: Any = door.router
         self._time.call_at(at_s, partial(router.arrive, sender, tag, payload))
@@ -342,12 +334,12 @@ class SwarmService(Service):
 
     # ------------------------------------------------------------ the service's side
 
-    def _receive(self, waiting: Waiting, payload: bytes, waits_since_s: float) -> None:
+    def _receive(self, waiting: Waiting, payload: bytes) -> None:
         sender = self._sent[waiting.tag].sender
         if waiting.sender != sender:
             detail = f"{sender} sent it, and it counts as sent by {waiting.sender}"
             self._invariants.violated("a command is its sender's", detail)
-        super()._receive(waiting, payload, waits_since_s)
+        super()._receive(waiting, payload)
 
     def _refuse(self, waiting: Waiting, reply: Reply, now_s: float) -> None:
         """A sender elsewhere that is refused too often is not answered each time; the others are counted."""
@@ -380,8 +372,7 @@ class SwarmService(Service):
         """A command whose sender was told that nobody answers is not carried out after that; a stop is."""
         waited_s = self._time.now_s() - self._sent[waiting.tag].at_s
         most_s = REPLY_TIMEOUT_S + (0.0 if waiting.sender.is_local else _REMOTE_S[1])
-        matters = ROWS[type(command)].logged and not isinstance(command, Stop)
-        if reply.accepted and matters and waited_s > most_s:
+        if reply.accepted and may_be_too_late(command) and waited_s > most_s:
             self._invariants.violated(
                 "a command whose sender has given up is not carried out",
                 f"{type(command).__name__} after {waited_s:.2f} s",

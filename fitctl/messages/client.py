@@ -15,7 +15,8 @@ import msgspec
 import zmq
 
 from fitctl.config import ConfigError
-from fitctl.messages.commands import MAX_COMMAND_BYTES, AnyCommand, Reply
+from fitctl.messages.command_table import may_be_too_late
+from fitctl.messages.commands import MAX_COMMAND_BYTES, AnyCommand, Reply, Status
 from fitctl.messages.endpoints import (
     COMMAND_SOCKET,
     TELEMETRY_SOCKET,
@@ -108,6 +109,10 @@ class Client:
         ConnectionError
             If no supervisor answers in time, or its reply cannot be read.
         """
+        if may_be_too_late(command):
+            if isinstance(self._where, RemoteKey) and not self._ahead_s:
+                self.send(Status(), timeout_s)  # its answer has the supervisor's time
+            command = msgspec.structs.replace(command, sent_s=self.now_s())
         payload, name = self._encode(command), type(command).__name__
         if len(payload) > MAX_COMMAND_BYTES:
             text = f"{name} takes {len(payload)} bytes; a command may take {MAX_COMMAND_BYTES}: make it shorter"

@@ -14,7 +14,7 @@ import msgspec
 from fitctl.config import ConfigError
 from fitctl.logging.records import CommandRecord
 from fitctl.messages import commands
-from fitctl.messages.commands import AnyCommand, Command, Reply, Stop
+from fitctl.messages.commands import AnyCommand, Command, MoveCollector, Reply, Stop
 
 Needs = Literal["any key", "the Unix socket", "a commander's key", "the instrument"]
 
@@ -221,17 +221,24 @@ def as_command(command: AnyCommand | str, loop: str = "") -> AnyCommand:
     return command
 
 
-def why_too_old(command: AnyCommand, waits_since_s: float, now_s: float) -> str:
-    """Why a command that may have waited since then is refused; empty if it is not.
+def may_be_too_late(command: AnyCommand) -> bool:
+    """Whether a command must not be carried out long after it was sent.
 
-    A stop is carried out however late; reports and questions, which are not logged one by one, change nothing.
+    What stops something is carried out however late; reports and questions, which are not logged one by one,
+    change nothing.
     """
-    waited_s = now_s - waits_since_s
-    if waited_s <= MOST_WAIT_S or isinstance(command, Stop) or not ROWS[type(command)].logged:
+    stops = isinstance(command, MoveCollector) and command.action == "stop"
+    return ROWS[type(command)].logged and not (stops or isinstance(command, Stop))
+
+
+def why_too_late(command: AnyCommand, now_s: float) -> str:
+    """Why a command that was sent long ago is refused; empty if it is not."""
+    waited_s = 0.0 if command.sent_s is msgspec.UNSET else now_s - command.sent_s
+    if not (waited_s > MOST_WAIT_S and may_be_too_late(command)):
         return ""
     return (
-        f"{type(command).__name__} may have waited for {waited_s:.1f} s, because the supervisor or its gateway "
-        f"stood still; after {MOST_WAIT_S:g} s a command is not carried out: send it again"
+        f"{type(command).__name__} was sent {waited_s:.1f} s ago; what arrives after {MOST_WAIT_S:g} s is not "
+        "carried out, because its sender may have given up: send it again"
     )
 
 

@@ -22,10 +22,14 @@ MAX_COMMAND_BYTES = 4096  # what is longer never reaches the supervisor
 
 
 class Command(msgspec.Struct, frozen=True, kw_only=True, tag=True, forbid_unknown_fields=True):
-    """The common base of commands; ``loop`` is empty for all loops."""
+    """The common base of commands; ``loop`` is empty for all loops.
+
+    ``sent_s`` is when it was sent, by the supervisor's clock, where that matters and the sender knows it.
+    """
 
     version: int = PROTOCOL_VERSION
     loop: str = ""
+    sent_s: float | msgspec.UnsetType = msgspec.UNSET
 
 
 class Standby(Command, frozen=True, kw_only=True):
@@ -137,7 +141,7 @@ class MoveCollector(Command, frozen=True, kw_only=True):
     @property
     def motion(self) -> dict[str, Any]:
         """What is given of the motion."""
-        common = {"version", "loop", "action"}
+        common = {*Command.__struct_fields__, "action"}
         given = msgspec.structs.asdict(self)
         return {name: v for name, v in given.items() if name not in common and v is not None}
 

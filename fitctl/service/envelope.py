@@ -16,16 +16,12 @@ MAX_ENVELOPE_BYTES = 1_048_576  # a report of some ten thousand keys
 
 
 class Passed(msgspec.Struct, frozen=True, kw_only=True, tag=True, forbid_unknown_fields=True):
-    """A message as it came, and the owner of its key; no local user can have such a name.
-
-    ``waits_since_s`` is since when it may have waited for the gateway, by the clock of the machine.
-    """
+    """A message as it came, and the owner of its key; no local user can have such a name."""
 
     name: Name
     role: Role
     address: str
     payload: bytes
-    waits_since_s: float
 
 
 class Report(msgspec.Struct, frozen=True, kw_only=True, tag=True, forbid_unknown_fields=True):

@@ -76,13 +76,7 @@ def admit(
     accepted = intake.accept(key.name, key.role, payload, now_s)
     if isinstance(accepted, Reply):
         return accepted
-    return Passed(
-        name=key.name,
-        role=key.role,
-        address=address,
-        payload=payload,
-        waits_since_s=intake.waits_since_s,
-    )
+    return Passed(name=key.name, role=key.role, address=address, payload=payload)
 
 
 class Gateway:
@@ -148,7 +142,6 @@ class Gateway:
             while not ending.is_set():
                 busy = poller.poll(int(_LOOK_S * 1000))
                 now_s = self._clock.now_s()
-                self._intake.begin_round(now_s)
                 if now_s >= look_s:
                     self._alive()
                     self._connect()

@@ -6,7 +6,6 @@ few seconds, so that a flood costs neither the loop its time nor the log its roo
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Collection
 from typing import NamedTuple
@@ -66,11 +65,6 @@ class Intake:
         From one person; as many may come at once.
     loops : collection of str
         The rig's loops: a stop for another one is not exempt from the rate.
-
-    Attributes
-    ----------
-    waits_since_s : float
-        Since when a message that is read in this round may have waited for the process.
     """
 
     def __init__(self, commands_per_s: float, loops: Collection[str]) -> None:
@@ -85,20 +79,6 @@ class Intake:
         self._records = Limit(_LOGGED_REFUSALS_PER_S, _LOGGED_REFUSALS_AT_ONCE)
         self._dropped: Counter[tuple[str, str]] = Counter()
         self._report_s = 0.0
-        self._round_s = self.waits_since_s = math.inf
-        self._caught_up_s = -math.inf
-
-    def begin_round(self, now_s: float) -> None:
-        """Messages are read from now on; the process may have stood still since the round before."""
-        stood_s = now_s - self._round_s
-        if stood_s > _STANDSTILL_S and self._round_s > self._caught_up_s:
-            self.waits_since_s = self._round_s
-            self._caught_up_s = now_s + _CAUGHT_UP_S
-        elif stood_s > _STANDSTILL_S:
-            self._caught_up_s += stood_s - _OF_A_ROUND_S
-        elif now_s > self._caught_up_s:
-            self.waits_since_s = min(self._round_s, now_s)
-        self._round_s = now_s
 
     def accept(self, name: str, role: Role, payload: bytes, now_s: float) -> Accepted | Reply:
         """Decode somebody's message: the command in it, or why it is rejected.
@@ -107,7 +87,10 @@ class Intake:
         Of these stops too, no more than 50 a second are accepted from one person.
         """
         command = decode_command(payload)
-        within_rate = self._commands.within(name, now_s)
+        row = None if isinstance(command, Reply) else ROWS[type(command)]
+        by_program = row is not None and not (row.word or row.label)
+        # A person's commands do not use up the rate of the recorder's, learner's and sequence's reports.
+        within_rate = self._commands.within(f"{name} reports" if by_program else name, now_s)
         stops = (
             isinstance(command, Stop) and role == "commander" and command.loop in self._stoppable
         )
@@ -117,7 +100,7 @@ class Intake:
         if isinstance(command, Reply):
             self.drop(name, "no commands")
             return command
-        if command.loop and ROWS[type(command)].of_rig:
+        if command.loop and row is not None and row.of_rig:
             text = f"{type(command).__name__} is for the whole rig; expected no loop, got {command.loop}"
             return Reply(accepted=False, text=text)
         return Accepted(command, not within_rate)

@@ -8,7 +8,6 @@ envelopes that are taken from its socket alone.
 
 from __future__ import annotations
 
-import math
 import threading
 from collections import deque
 from contextlib import suppress
@@ -23,7 +22,7 @@ import zmq
 from fitctl.clock import Clock
 from fitctl.config import ConfigError
 from fitctl.logging.records import Snapshot
-from fitctl.messages.command_table import ROWS, command_record, why_too_old
+from fitctl.messages.command_table import ROWS, command_record, why_too_late
 from fitctl.messages.commands import (
     AnyCommand,
     RecentEvents,
@@ -124,6 +123,7 @@ class Service(threading.Thread):
         """Publish once more, send what replies there are, and end."""
         self._ending.set()
         self.join(timeout=5.0)
+        self._supervisor.record_left()  # no step follows
 
     def run(self) -> None:
         """Serve; this is the thread."""
@@ -133,9 +133,7 @@ class Service(threading.Thread):
         publish_s = report_s = self._clock.now_s()
         try:
             while not self._ending.is_set():
-                busy = poller.poll(ROUND_MS)
-                self._intake.begin_round(self._clock.now_s())
-                if busy:
+                if poller.poll(ROUND_MS):
                     self._serve()
                     self._send_replies()
                     self._ending.wait(ROUND_MS / 1000)  # however much more there is
@@ -190,7 +188,7 @@ class Service(threading.Thread):
             waiting = Waiting(
                 self._local, parcel.identity, parcel.tag, local_sender(parcel.payload)
             )
-            self._receive(waiting, bytes(parcel.payload.buffer), math.inf)
+            self._receive(waiting, bytes(parcel.payload.buffer))
         for parcel in self._gateway.receive(MESSAGES_A_ROUND):
             self._open(parcel.identity, parcel.tag, bytes(parcel.payload.buffer))
 
@@ -199,8 +197,7 @@ class Service(threading.Thread):
         match decode_envelope(payload):
             case Passed() as passed:
                 sender = Sender(passed.name, passed.address, passed.role, is_local=False)
-                waiting = Waiting(self._gateway, identity, tag, sender)
-                self._receive(waiting, passed.payload, passed.waits_since_s)
+                self._receive(Waiting(self._gateway, identity, tag, sender), passed.payload)
             case Report() as report:
                 self._apply_report(report)
             case None:
@@ -218,8 +215,7 @@ class Service(threading.Thread):
         for severity, text in report.events:
             self._supervisor.report_event(severity, GATEWAY, text)
 
-    def _receive(self, waiting: Waiting, payload: bytes, waits_since_s: float) -> None:
-        """Take somebody's message, which may have waited for the gateway since then."""
+    def _receive(self, waiting: Waiting, payload: bytes) -> None:
         sender, now_s = waiting.sender, self._clock.now_s()
         accepted = self._intake.accept(sender.name, sender.role, payload, now_s)
         if isinstance(accepted, Reply):
@@ -227,8 +223,7 @@ class Service(threading.Thread):
         elif accepted.over_rate and self._joins_a_stop(waiting, accepted.command):
             self._intake.drop(sender.name, "stops besides one under way")
         else:
-            since_s = min(waits_since_s, self._intake.waits_since_s)
-            self._obey(waiting, accepted.command, since_s, now_s)
+            self._obey(waiting, accepted.command, now_s)
 
     def _joins_a_stop(self, waiting: Waiting, command: AnyCommand) -> bool:
         """Whether this stop, of too many, waits for the answer to one that is under way."""
@@ -237,12 +232,10 @@ class Service(threading.Thread):
         self._stops[command.loop].append(waiting)
         return True
 
-    def _obey(
-        self, waiting: Waiting, command: AnyCommand, waits_since_s: float, now_s: float
-    ) -> None:
+    def _obey(self, waiting: Waiting, command: AnyCommand, now_s: float) -> None:
         sender = waiting.sender
         commander = self._admission.commander(now_s)
-        refusal = why_too_old(command, waits_since_s, now_s)
+        refusal = why_too_late(command, now_s)
         refusal = refusal or self._admission.refusal(sender, command, now_s)
         match command:
             case _ if refusal:
@@ -269,7 +262,7 @@ class Service(threading.Thread):
                 if stops:
                     self._stops.setdefault(command.loop, deque(maxlen=_JOINED_STOPS))
                 done = partial(self._done, waiting, command.loop if stops else None)
-                self._supervisor.post(command, done, sender.name, sender.address, waits_since_s)
+                self._supervisor.post(command, done, sender.name, sender.address)
 
     def _taken_over(self, before: str, now: str) -> str:
         text = f"{now} has the instrument"

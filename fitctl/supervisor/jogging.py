@@ -63,7 +63,9 @@ def _beyond(rig: Rig, loop: Loop, step_sky_arcsec: Floats) -> str:
         return f"a jog is at most a field of view, {most_arcsec:.1f} arcsec on the sky"
     stage, settings = loop.siderostat, loop.settings.siderostat
     step_rad = step_sky_arcsec / ARCSEC_PER_RAD / settings.sky_rad_per_motor_rad
-    if np.abs(stage.setpoint_rad + step_rad).max() > stage.travel_rad:
+    away_rad = np.abs(stage.setpoint_rad + step_rad)
+    # One that has turned on beyond its travel can be jogged back.
+    if np.any((away_rad > stage.travel_rad) & (away_rad > np.abs(stage.setpoint_rad))):
         return (
             f"siderostat {loop.name} would leave its travel of ±{settings.travel_sky_arcsec:g} arcsec on "
             "the sky; jog the other way"

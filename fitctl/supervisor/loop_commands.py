@@ -86,6 +86,11 @@ def start_experiment(rig: Rig, loops: StellarLoops, command: Experiment) -> str:
 
 def why_no_search(rig: Rig, loops: Loops, command: Acquire) -> str:
     """Why a search cannot be as it is asked for; empty if it can."""
+    if len(loops) > 1 and (command.expected_az_sky_arcsec, command.expected_el_sky_arcsec) != (
+        None,
+        None,
+    ):
+        return f"acquire: a place is of one loop; name the loop: {', '.join(loop.name for loop in loops)}"
     refused = (
         refused_area(loop.settings, loop.name, command)
         if isinstance(loop, MetrologyLoop)

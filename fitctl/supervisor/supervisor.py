@@ -36,7 +36,7 @@ from fitctl.loop.loop import Loop
 from fitctl.loop.metrology import MetrologyLoop, metrology_loop
 from fitctl.loop.overlap import OverlapMeter
 from fitctl.loop.stellar import StellarLoop, stellar_loop
-from fitctl.messages.command_table import ROWS, command_record, why_too_old
+from fitctl.messages.command_table import ROWS, command_record, why_too_late
 from fitctl.messages.commands import (
     Acquire,
     AnyCommand,
@@ -85,6 +85,7 @@ _COMMANDS: dict[type[AnyCommand], Trigger] = {
     Recover: Trigger.RECOVER,
     Off: Trigger.OFF,
 }
+_WITHOUT_DEVICES = {Trigger.STOP, Trigger.RELEASE}  # obeyed also while devices are opened or closed
 GOES_TO_BIAS = "is on its way to its bias"
 """In the answer to an `Off` that is refused, but moves a mirror."""
 _POWER_UP = {Trigger.STANDBY, Trigger.RECOVER}
@@ -101,13 +102,12 @@ def loop_of_kind(
 
 
 class Posted(NamedTuple):
-    """A command on its way to the next step: whom it answers, who gave it from where, since when it waits."""
+    """A command on its way to the next step: whom it answers, and who gave it from where."""
 
     command: AnyCommand
     reply: Callable[[Reply], None]
     sender: str
     address: str
-    waits_since_s: float
 
 
 class Supervisor:
@@ -217,20 +217,17 @@ class Supervisor:
         reply: Callable[[Reply], None],
         sender: str = "",
         address: str = "",
-        waits_since_s: float = math.inf,
     ) -> None:
         """Leave a command for the next step; `reply` is called from there.
-
-        It is refused there if it may have waited too long since `waits_since_s`.
 
         A stop takes the velocity from the siderostats, and stops the hexapod, here and now; the rest follows
         at the next step.
         """
-        if isinstance(command, Stop):
+        if isinstance(command, Stop) and (names := self._named(command)):
             self._stop_collector()
-            for name in self._named(command):
+            for name in names:
                 self.loops[name].servo.stop()
-        self._commands.append(Posted(command, reply, sender, address, waits_since_s))
+        self._commands.append(Posted(command, reply, sender, address))
         if self._closed:  # no step follows
             self._end_posted()
 
@@ -294,7 +291,7 @@ class Supervisor:
         self._finish_jobs()
         self._obey_posted()
         self._frame_rate.check()
-        self._record_left()
+        self.record_left()
         lost = self._camera.counts.lost if self._camera.ready else 0
         for loop in loops:
             loop.sense(frame, lost, self._camera.skipped)
@@ -371,7 +368,7 @@ class Supervisor:
         finally:
             if self.collector is not None:
                 self.collector.close()
-            self._record_left()
+            self.record_left()
 
     def _stop_collector(self) -> None:
         if self.collector is not None:
@@ -382,7 +379,8 @@ class Supervisor:
         for loop in self.stellar_loops.values():
             loop.device_failed(CAMERA, error)
 
-    def _record_left(self) -> None:
+    def record_left(self) -> None:
+        """Record what was left since the last step; after :meth:`close`, also what the service left since."""
         while self._left:
             self._record(self._left.popleft())
         while self._quantities:
@@ -401,7 +399,7 @@ class Supervisor:
 
     def _obey_posted(self) -> None:
         for posted in self._taken():
-            why_not = why_too_old(posted.command, posted.waits_since_s, self._clock.now_s())
+            why_not = why_too_late(posted.command, self._clock.now_s())
             reply = _refusal(why_not) if why_not else self._obey(posted.command)
             self._answer(posted, reply, self._record)
 
@@ -421,11 +419,11 @@ class Supervisor:
         return [name for name in self.loops if command.loop in {"", name}]
 
     def _obey(self, command: AnyCommand) -> Reply:
-        if isinstance(command, Stop):
-            self._stop_collector()  # a start that came before the stop was obeyed only now
         names = self._named(command)
         if not names:
             return _refusal(f"no loop is named {command.loop}; the rig has {', '.join(self.loops)}")
+        if isinstance(command, Stop):
+            self._stop_collector()  # a start that came before the stop was obeyed only now
         if isinstance(command, Shutdown):
             self.shutdown_wanted = True
             return Reply(accepted=True, text="shutting down")
@@ -491,7 +489,7 @@ class Supervisor:
         usable = [name for name in names if trigger in self.loops[name].usable_commands]
         if not usable:
             return _refusal(self._why_not(trigger, names))
-        if self._device_jobs.busy and trigger is not Trigger.STOP:
+        if self._device_jobs.busy and trigger not in _WITHOUT_DEVICES:
             return _refusal(
                 "devices are being opened or closed; wait for the event that reports the end"
             )

@@ -61,7 +61,9 @@ class Served:
         self.simulation = Simulation(self.rig, 0, star_offset_px=(9.0, 4.0), record=self.record)
         post = self.simulation.supervisor.post
         # The simulation has a time of its own, by which nothing waits for long.
-        self.simulation.supervisor.post = lambda *command: post(*command[:4])
+        self.simulation.supervisor.post = lambda command, *rest: post(
+            msgspec.structs.replace(command, sent_s=msgspec.UNSET), *rest
+        )
         state = ServiceState(
             pid=os.getpid(),
             wall_minus_monotonic_s=0.0,

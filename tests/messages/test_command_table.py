@@ -1,13 +1,34 @@
 """One schema of commands: nothing is missing from the table, nothing is there twice."""
 
+import math
 from typing import get_args
 
+import msgspec
 import pytest
 
 from fitctl.cli import main
 from fitctl.config import ConfigError
-from fitctl.messages.command_table import COMMANDS, ROWS, WORDS, as_command, command_of
-from fitctl.messages.commands import Acquire, AnyCommand, Reply, Reset, SetTarget, Stop
+from fitctl.messages.client import REPLY_TIMEOUT_S
+from fitctl.messages.command_table import (
+    COMMANDS,
+    MOST_WAIT_S,
+    ROWS,
+    WORDS,
+    as_command,
+    command_of,
+    why_too_late,
+)
+from fitctl.messages.commands import (
+    Acquire,
+    AnyCommand,
+    MoveCollector,
+    Reply,
+    Reset,
+    SetTarget,
+    Standby,
+    Status,
+    Stop,
+)
 
 
 def test_every_command_is_in_the_table_once():
@@ -115,3 +136,34 @@ def test_what_is_no_command_at_all_raises(given):
 def test_a_message_has_its_own_loop():
     with pytest.raises(TypeError):
         as_command(Stop(), "right")
+
+
+# ---------------------------------------------------------------- commands that come too late
+
+
+@pytest.mark.parametrize(("ago_s", "is_refused"), [(1.7, False), (1.8, True)])
+def test_a_command_whose_sender_has_given_up_is_refused(ago_s, is_refused):
+    why_not = why_too_late(Standby(sent_s=10.0), 10.0 + ago_s)
+
+    assert bool(why_not) == is_refused
+    if is_refused:
+        assert why_not.startswith(
+            "Standby was sent 1.8 s ago; what arrives after 1.75 s is not carried out"
+        )
+        assert why_not.endswith("send it again")
+
+
+@pytest.mark.parametrize(
+    "command", [Stop(sent_s=0.0), MoveCollector(action="stop", sent_s=0.0), Status(sent_s=0.0)]
+)
+def test_what_stops_something_never_comes_too_late_nor_does_a_question(command):
+    assert why_too_late(command, 1000.0) == ""
+
+
+@pytest.mark.parametrize("sent_s", [msgspec.UNSET, math.nan, math.inf, 2000.0])
+def test_a_command_of_a_program_without_the_supervisors_clock_is_never_too_late(sent_s):
+    assert why_too_late(Standby(sent_s=sent_s), 1000.0) == ""
+
+
+def test_what_waits_is_refused_before_its_sender_gives_up():
+    assert MOST_WAIT_S < REPLY_TIMEOUT_S

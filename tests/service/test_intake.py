@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fitctl.messages.client import REPLY_TIMEOUT_S
-from fitctl.messages.command_table import COMMANDS, MOST_WAIT_S, why_too_old
-from fitctl.messages.commands import Reply, Standby, Status, Stop
+from fitctl.logging.records import RecorderStatus
+from fitctl.messages.command_table import COMMANDS
+from fitctl.messages.commands import RecorderReport, Reply, Status, Stop
 from fitctl.service.intake import Accepted, Intake, Limit
 
 STATUS, STOP = msgspec.msgpack.encode(Status()), msgspec.msgpack.encode(Stop())
@@ -103,58 +103,6 @@ def test_what_was_turned_back_is_told_by_whose_it_was_and_not_too_often(intake):
     assert intake.dropped(10.0) == ["bob: 1 messages, no commands"]
 
 
-# ---------------------------------------------------------------- how long messages may have waited
-
-
-def waits_since(intake, *rounds_s):
-    since_s = []
-    for now_s in rounds_s:
-        intake.begin_round(now_s)
-        since_s.append(intake.waits_since_s)
-    return since_s
-
-
-def test_a_message_has_waited_since_the_round_before_at_most(intake):
-    assert waits_since(intake, 10.0, 10.005, 10.2) == [10.0, 10.0, 10.005]
-
-
-def test_after_a_standstill_what_is_read_for_a_moment_may_have_waited_since_its_beginning(intake):
-    since_s = waits_since(intake, 10.0, 14.0, 14.2, 14.4, 14.6, 14.7)
-
-    assert since_s == [10.0, 10.0, 10.0, 10.0, 14.4, 14.6]
-
-
-def test_what_came_during_a_standstill_may_still_be_unread_after_the_next(intake):
-    since_s = waits_since(intake, 10.0, 12.5, 12.55, 13.6, 13.8, 13.95, 14.05)
-
-    assert since_s == [10.0, 10.0, 10.0, 10.0, 10.0, 10.0, 13.95]
-
-
-def test_a_process_that_stands_still_again_and_again_still_accepts_what_has_just_come(intake):
-    since_s = waits_since(intake, *(10.0 + second for second in range(60)))
-
-    assert len({*since_s}) == 10
-
-
-@pytest.mark.parametrize(("waited_s", "is_refused"), [(1.7, False), (1.8, True)])
-def test_a_command_that_its_sender_has_given_up_is_not_carried_out(waited_s, is_refused):
-    why_not = why_too_old(Standby(), 10.0, 10.0 + waited_s)
-
-    assert bool(why_not) == is_refused
-    if is_refused:
-        assert "Standby may have waited for 1.8 s" in why_not
-        assert why_not.endswith("send it again")
-
-
-@pytest.mark.parametrize("command", [Stop(), Status()])
-def test_a_stop_never_comes_too_late_and_a_question_changes_nothing(command):
-    assert why_too_old(command, 0.0, 1000.0) == ""
-
-
-def test_what_waits_is_refused_before_its_sender_gives_up():
-    assert MOST_WAIT_S < REPLY_TIMEOUT_S
-
-
 @pytest.mark.parametrize("row", [row for row in COMMANDS if row.of_rig], ids=lambda row: row.name)
 def test_a_command_for_the_whole_rig_is_for_no_loop(intake, row):
     values = {"action": "start", "rate_hz": 48.0}
@@ -164,3 +112,14 @@ def test_a_command_for_the_whole_rig_is_for_no_loop(intake, row):
 
     assert not reply.accepted
     assert reply.text == f"{row.name} is for the whole rig; expected no loop, got right"
+
+
+def test_a_persons_commands_do_not_use_up_the_rate_of_their_programs_reports(intake):
+    status = RecorderStatus(time_s=1.0, path="x.mcap", records=5, lost=0, bytes_written=9)
+    report = msgspec.msgpack.encode(RecorderReport(status=status))
+    for _ in range(100):
+        intake.accept("anna", "commander", STATUS, 0.0)
+
+    accepted = [intake.accept("anna", "commander", report, 0.0) for _ in range(11)]
+
+    assert [isinstance(each, Accepted) for each in accepted] == [True] * 10 + [False]

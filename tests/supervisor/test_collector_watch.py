@@ -358,3 +358,13 @@ def test_a_course_that_cannot_be_read_is_reported_in_its_own_words(watched, monk
 
     reported(watch, why)
     assert watch.error == why
+
+
+def test_a_stop_for_a_loop_that_the_rig_does_not_have_is_refused_and_stops_nothing():
+    simulation = drifting()
+
+    reply = simulation.command(Stop(loop="nobody"))
+    simulation.run(0.5)
+
+    assert "no loop is named nobody" in reply.text
+    assert simulation.supervisor.collector.drive.running

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from fitctl.config import ARCSEC_PER_RAD
 from fitctl.messages.commands import (
     Acquire,
     Jog,
@@ -147,3 +148,15 @@ def test_the_search_leaves_the_mirror_where_the_operator_put_it(standby):
     standby.command(Release())
     standby.run(0.5)
     assert loop_of(standby).mirror.now_rad[0] * 1e6 == pytest.approx(30.0, abs=0.5)
+
+
+def test_a_siderostat_beyond_its_travel_can_be_jogged_back_and_no_farther(standby):
+    """It turned on while its amplifiers did not answer."""
+    stage = loop_of(standby).siderostat
+    step = 20.0  # arcsec on the sky
+    beyond_rad = step / ARCSEC_PER_RAD / loop_of(standby).settings.siderostat.sky_rad_per_motor_rad
+    stage.hold(np.array([stage.travel_rad + 2.0 * beyond_rad, 0.0]))
+
+    assert "jog the other way" in standby.command(Jog(az_sky_arcsec=step, el_sky_arcsec=0.0)).text
+    assert standby.command(Jog(az_sky_arcsec=-step, el_sky_arcsec=0.0)).accepted
+    assert standby.command(Jog(az_sky_arcsec=0.0, el_sky_arcsec=step)).accepted

@@ -2,13 +2,15 @@
 
 import numpy as np
 import pytest
-from instruments.simulated import events_of, failing, mode_of, until
+from instruments.simulated import SlowExecutor, events_of, failing, mode_of, until
 
+from fitctl.config import default_rig_path, load_rig
 from fitctl.drivers.interface import DeviceTimeout, DeviceUnreachable
 from fitctl.logging.records import CommandRecord, DeviceHealth, FrameRecord, PiezoReading, Tick
 from fitctl.messages.commands import Acquire, Off, Recover, Release, SetBiasOffset, Standby, Stop
 from fitctl.messages.modes import Mode
 from fitctl.simulation.devices import InlineExecutor
+from fitctl.simulation.simulation import Simulation
 
 FAULTS = {
     "camera": ("camera", "next_frame"),
@@ -239,14 +241,14 @@ def test_what_comes_after_the_instrument_is_closed_is_answered(vernier):
 def test_a_command_that_waits_for_a_step_longer_than_its_sender_is_refused_and_a_stop_is_not(
     vernier,
 ):
-    replies, since_s = [], vernier.clock.now_s()
-    vernier.supervisor.post(Release(), replies.append, waits_since_s=since_s - 1.9)
+    replies, sent_s = [], vernier.clock.now_s() - 1.9
+    vernier.supervisor.post(Release(sent_s=sent_s), replies.append)
     vernier.supervisor.step()
 
     assert not replies[0].accepted
-    assert "Release may have waited for 1.9 s" in replies[0].text
+    assert "Release was sent 1.9 s ago" in replies[0].text
     assert mode_of(vernier) is Mode.VERNIER
-    vernier.supervisor.post(Stop(), replies.append, waits_since_s=since_s - 1.9)
+    vernier.supervisor.post(Stop(sent_s=sent_s), replies.append)
     vernier.supervisor.step()
     assert mode_of(vernier) is Mode.SAFE
 
@@ -345,3 +347,42 @@ def test_after_a_stall_the_newest_frame_is_acted_on_and_older_ones_are_logged(ve
     assert mode_of(vernier) is Mode.VERNIER
     assert vernier.ticks[-1].frames_skipped == tick.frames_skipped
     assert not vernier.supervisor.loops["right"].interlocks.tripped
+
+
+def test_a_star_is_released_while_another_loops_devices_are_opened():
+    pair = Simulation(load_rig(default_rig_path().with_name("two-stars.toml")), 0)
+    for command in (Standby(loop="right"), Acquire(loop="right")):
+        assert pair.command(command).accepted
+        pair.run(0.5)
+    pair.supervisor._device_jobs._executor = SlowExecutor()
+    assert pair.command(Standby(loop="left")).accepted
+    pair.run(0.1)
+    assert pair.supervisor._device_jobs.busy
+
+    assert pair.command(Release(loop="right")).accepted
+    assert pair.supervisor.loops["right"].mode is Mode.STANDBY
+
+
+def test_a_place_to_search_at_is_of_one_loop():
+    pair = Simulation(load_rig(default_rig_path().with_name("two-stars.toml")), 0)
+    assert pair.command(Standby()).accepted
+    pair.run(0.5)
+    place = {"expected_az_sky_arcsec": 200.0, "expected_el_sky_arcsec": 0.0}
+
+    reply = pair.command(Acquire(**place))
+
+    assert reply.text == "acquire: a place is of one loop; name the loop: right, left"
+    assert pair.command(Acquire(loop="left", **place)).accepted
+
+
+def test_what_the_service_leaves_after_the_end_is_recorded_once_it_has_ended(vernier):
+    vernier.supervisor.stop("shutting down")
+    vernier.supervisor.close()
+    vernier.supervisor.post(Stop(), lambda _reply: None, "anna")
+    vernier.supervisor.report_event("warning", "service", "anna: 100 messages")
+
+    vernier.supervisor.record_left()
+
+    stops = [record for record in vernier.records if isinstance(record, CommandRecord)]
+    assert stops[-1].sender == "anna"
+    assert events_of(vernier)[-1].message == "anna: 100 messages"

@@ -123,11 +123,7 @@ def test_a_command_that_was_reported_as_unanswered_is_not_carried_out_later(rig,
         stood_still.resume()
 
     assert commander_now(rig) != "anna"
-    end_s = time.monotonic() + START_S
-    while not (reply := rig.anna.send(TakeOver())).accepted:
-        assert "TakeOver may have waited for" in reply.text
-        assert time.monotonic() < end_s
-        time.sleep(0.1)
+    assert rig.anna.send(TakeOver()).accepted
     assert commander_now(rig) == "anna"
     assert rig.client.send(TakeOver()).accepted
 
