@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -46,7 +48,8 @@ def print_pdf(page: Path, pdf: Path, *, sandbox: bool = True) -> None:
         )
         raise PdfError(msg)
     _remove(pdf)
-    with tempfile.TemporaryDirectory(prefix="fitctl-") as profile:
+    # What a browser that was ended has left is no reason for an error.
+    with tempfile.TemporaryDirectory(prefix="fitctl-", ignore_cleanup_errors=True) as profile:
         arguments = [
             "--headless",
             "--disable-gpu",
@@ -58,24 +61,47 @@ def print_pdf(page: Path, pdf: Path, *, sandbox: bool = True) -> None:
             page.resolve().as_uri(),
         ]
         try:
-            done = subprocess.run(
-                [browser, *arguments], capture_output=True, text=True, timeout=_LIMIT_S, check=False
-            )
+            status, printed = _ended([browser, *arguments])
         except subprocess.TimeoutExpired:
             msg = f"no PDF: {browser} did not end within {_LIMIT_S:g} s; print {page} from any browser"
             raise PdfError(msg) from None
         except OSError as error:
             msg = f"no PDF: {browser} cannot be started: {error.strerror}; print {page} from any browser"
             raise PdfError(msg) from None
-    if done.returncode or not pdf.exists():
-        if sandbox and "No usable sandbox" in done.stderr:
+    if status or not pdf.exists():
+        if sandbox and "No usable sandbox" in printed:
             msg = f"no PDF: {browser} cannot use its sandbox; add --pdf-without-sandbox if you trust the log"
             raise PdfError(msg)
-        last = (done.stderr.strip().splitlines() or ["nothing"])[-1]
-        msg = (
-            f"no PDF: {browser} ended with {done.returncode}: {last}; print {page} from any browser"
-        )
+        last = (printed.strip().splitlines() or ["nothing"])[-1]
+        msg = f"no PDF: {browser} ended with {status}: {last}; print {page} from any browser"
         raise PdfError(msg)
+
+
+def _ended(command: list[str]) -> tuple[int, str]:
+    """Run a browser to its end, in a group of its own, of which nothing is left: its status and its errors.
+
+    Raises
+    ------
+    subprocess.TimeoutExpired
+        If it takes longer than 120 s.
+    OSError
+        If it cannot be started.
+    """
+    with subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        errors="replace",
+        start_new_session=True,
+    ) as browser:
+        try:
+            _, printed = browser.communicate(timeout=_LIMIT_S)
+        finally:
+            with suppress(ProcessLookupError):
+                os.killpg(browser.pid, signal.SIGKILL)
+    return browser.returncode, printed
 
 
 def _remove(pdf: Path) -> None:

@@ -5,7 +5,9 @@ import os
 import shutil
 from pathlib import Path
 
+import psutil
 import pytest
+from instruments.served import until
 from samples.report_samples import record
 
 from fitctl.cli import main
@@ -110,6 +112,27 @@ def test_a_browser_that_fails_is_told(script, told, tmp_path, monkeypatch):
 
     with pytest.raises(PdfError, match=told):
         print_pdf(tmp_path / "report.html", tmp_path / "report.pdf", sandbox=False)
+
+
+def test_of_a_browser_that_does_not_end_nothing_is_left(tmp_path, monkeypatch):
+    """Its children, such as one that goes on writing into its profile, would outlive it."""
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setattr("fitctl.report.pdf._LIMIT_S", 0.5)
+    child = tmp_path / "child"
+    browser(
+        tmp_path,
+        f"""
+        for each in "$@"; do case "$each" in --user-data-dir=*) profile=${{each#*=}};; esac; done
+        (n=0; while :; do n=$((n + 1)); : > "$profile/$n"; done) &
+        echo $! > {child}
+        exec /bin/sleep 60
+        """,
+    )
+
+    with pytest.raises(PdfError, match="did not end within"):
+        print_pdf(tmp_path / "report.html", tmp_path / "report.pdf", sandbox=False)
+
+    until(lambda: not psutil.pid_exists(int(child.read_text())))
 
 
 def test_an_earlier_pdf_does_not_pass_for_one_that_was_not_written(tmp_path, monkeypatch):
