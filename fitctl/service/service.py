@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from collections.abc import Iterable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -99,7 +100,7 @@ class Service(threading.Thread):
         self._clock = clock
         self._period_s = 1.0 / supervisor.rig.supervisor.telemetry_hz
         self._ending = threading.Event()
-        self._replies: SimpleQueue[tuple[Waiting, Reply, str | None]] = SimpleQueue()
+        self._replies: SimpleQueue[tuple[Waiting, Reply, Iterable[Waiting]]] = SimpleQueue()
         self._stops: dict[str, deque[Waiting]] = {}  # by loop: who waits with one that is under way
         self._encode = msgspec.msgpack.Encoder().encode
         self._intake = Intake(settings.commands_per_s, supervisor.loops)
@@ -227,9 +228,10 @@ class Service(threading.Thread):
 
     def _joins_a_stop(self, waiting: Waiting, command: AnyCommand) -> bool:
         """Whether this stop, of too many, waits for the answer to one that is under way."""
-        if command.loop not in self._stops:
+        joined = self._stops.get(command.loop)
+        if joined is None:
             return False
-        self._stops[command.loop].append(waiting)
+        joined.append(waiting)
         return True
 
     def _obey(self, waiting: Waiting, command: AnyCommand, now_s: float) -> None:
@@ -272,8 +274,10 @@ class Service(threading.Thread):
         return text
 
     def _done(self, waiting: Waiting, stopped: str | None, reply: Reply) -> None:
-        """Leave the reply for this thread; called from the supervisor's."""
-        self._replies.put((waiting, reply, stopped))
+        """Leave the reply for this thread; called from the supervisor's, before it obeys the next command."""
+        # No stop joins this one from now on: a `recover` may come between the two.
+        joined = () if stopped is None else self._stops.pop(stopped, ())
+        self._replies.put((waiting, reply, joined))
 
     def _answer_here(self, waiting: Waiting, command: AnyCommand, reply: Reply) -> None:
         """Answer what does not reach the supervisor, and keep who asked."""
@@ -294,12 +298,11 @@ class Service(threading.Thread):
     def _send_replies(self) -> None:
         while True:
             try:
-                waiting, reply, stopped = self._replies.get_nowait()
+                waiting, reply, joined = self._replies.get_nowait()
             except Empty:
                 return
-            self._answer(waiting, reply)
-            for joined in self._stops.pop(stopped, ()) if stopped is not None else ():
-                self._answer(joined, reply)
+            for each in (waiting, *joined):
+                self._answer(each, reply)
 
     def _answer(self, waiting: Waiting, reply: Reply) -> None:
         timed = msgspec.structs.replace(reply, time_s=self._clock.now_s())

@@ -26,6 +26,8 @@ from fitctl.messages.commands import (
 )
 from fitctl.messages.endpoints import make_service_folder, service_folder
 from fitctl.model.drives import Drive
+from fitctl.service.admission import Sender
+from fitctl.service.service import Waiting
 from fitctl.service.telemetry_buffer import CountingBuffer
 
 
@@ -316,3 +318,20 @@ def test_a_client_says_when_it_sent_a_command(served, monkeypatch):
     standby, stop = posted
     assert before_s <= standby.sent_s <= time.monotonic()
     assert stop.sent_s is msgspec.UNSET  # a supervisor of an older fitctl obeys it too
+
+
+def test_a_stop_of_too_many_joins_none_that_was_obeyed_already(slow_clock):
+    """A `recover` may have been obeyed in between."""
+    service, supervisor = slow_clock.service, slow_clock.simulation.supervisor
+    slow_clock.ending.set()  # this test makes the steps
+    slow_clock.stepper.join()
+    anna = Sender("anna", "here", "commander", is_local=True)
+
+    def send_stop():
+        waiting = Waiting(service._local, b"anna", b"tag", anna)
+        service._receive(waiting, msgspec.msgpack.encode(Stop()))
+        return len(supervisor._commands)
+
+    assert [send_stop() for _ in range(6)] == [1, 2, 3, 4, 5, 5]  # the last joins those before
+    supervisor.step()
+    assert send_stop() == 1
