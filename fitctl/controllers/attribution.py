@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import HALF_WINDOW_PX, Rig
+from fitctl.config import HALF_WINDOW_PX, Camera
 from fitctl.model.compiled import compilable
 
+Floats = NDArray[np.float64]
 FOLLOWED_PX = 2.0 * HALF_WINDOW_PX  # from where it is expected to a star that is followed
 PROVEN_PX = 1.0 * HALF_WINDOW_PX  # likewise to a candidate that the stages have moved
 MOVE_PX = 3.0 * HALF_WINDOW_PX  # from the target to the other places of a second look
@@ -46,19 +48,21 @@ def second_look(looks_px: Any, az_px: float, el_px: float, rejected: int) -> int
     return rejected % LOOKS
 
 
-def look_places_px(rig: Rig, loop_name: str) -> NDArray[np.float64]:
+def look_places_px(camera: Camera, target_px: Floats, other_targets_px: Iterable[Floats]) -> Floats:
     """Where a loop looks at candidates again, shape (LOOKS, 2): at its target, and on both sides of it.
 
     To both sides means across the direction of the nearest other target: near its own, a candidate's light does
     not reach what another loop follows there.
+
+    Parameters
+    ----------
+    camera : Camera
+    target_px : array, shape (2,)
+    other_targets_px : iterable of arrays, shape (2,)
+        Those of other loops.
     """
-    targets_px = {
-        name: np.array([loop.target_px.az, loop.target_px.el])
-        for name, loop in rig.stellar_loops.items()
-    }
-    target_px = targets_px.pop(loop_name)
-    away_px = [np.abs(other_px - target_px) for other_px in targets_px.values()]
+    away_px = [np.abs(other_px - target_px) for other_px in other_targets_px]
     nearest_px = min(away_px, key=np.max, default=np.zeros(2))
     aside_px = MOVE_PX * np.array([0.0, 1.0] if nearest_px[0] >= nearest_px[1] else [1.0, 0.0])
     places_px = np.array([target_px, target_px + aside_px, target_px - aside_px])
-    return np.clip(places_px, HALF_WINDOW_PX, rig.camera.largest_window_px)
+    return np.clip(places_px, HALF_WINDOW_PX, camera.largest_window_px)

@@ -25,7 +25,8 @@ _SUMS = np.array(
     ]
 )
 EDGE_PX = HALF_WINDOW_PX - 1.5  # nearer to its edge, the window would cut the spot
-MAX_CANDIDATES = 6
+MAX_CANDIDATES = 6  # spots of a frame that are looked at
+MOST_HOT = 24  # pixels of a frame that are passed over as no spots
 REACH_DIAMETERS = 1.0  # from the centre of a spot: beyond lies a part of its light in 10 000
 _EDGES_PX = np.arange(-HALF_WINDOW_PX, HALF_WINDOW_PX + 2.0) - 0.5
 _STEPS_PER_PX = 64  # of the table of near spots' light: a place is wrong by 0.008 px at most
@@ -141,12 +142,6 @@ class StarSensor:
         """Eq. 7 over the window nearest to the given centre; None when this loop's star is not in it."""
         return self._accepted(self._centroid(image, window_az_px, window_el_px))
 
-    def follow(
-        self, image: NDArray[np.uint16], expected_az_px: float, expected_el_px: float
-    ) -> Star | None:
-        """:meth:`measure` where the star is expected; :meth:`find` it where that does not do."""
-        return self.in_window(image, expected_az_px, expected_el_px) or self.find(image)
-
     def in_window(
         self, image: NDArray[np.uint16], expected_az_px: float, expected_el_px: float
     ) -> Star | None:
@@ -164,11 +159,14 @@ class StarSensor:
     def candidates(self, image: NDArray[np.uint16]) -> Iterator[Star]:
         """All spots that could be this loop's star, brightest first."""
         search = self._dark.light(image, 0, 0, *image.shape)
-        for _ in range(MAX_CANDIDATES):
+        spots = 0
+        for _ in range(MAX_CANDIDATES + MOST_HOT):
             el_px, az_px = divmod(int(search.argmax()), search.shape[1])
-            if search[el_px, az_px] < self.threshold_dn:
+            if search[el_px, az_px] < self.threshold_dn or spots == MAX_CANDIDATES:
                 return
-            star = self.find_at(image, az_px, el_px)
+            spot = self._centroid(image, az_px, el_px)
+            spots += spot is not None
+            star = self._whole(image, spot)
             if star is not None:
                 yield star
             search[
@@ -178,11 +176,14 @@ class StarSensor:
 
     def find_at(self, image: NDArray[np.uint16], az_px: float, el_px: float) -> Star | None:
         """Measure this loop's star about a place; None when it is not there, or the frame cuts it."""
-        candidate = self._centroid(image, az_px, el_px)
-        if candidate is not None:
+        return self._whole(image, self._centroid(image, az_px, el_px))
+
+    def _whole(self, image: NDArray[np.uint16], spot: Star | None) -> Star | None:
+        """A spot, if it is this loop's star and the frame does not cut it."""
+        if spot is not None:
             # Once more about its own centre, so that the window does not cut the spot.
-            candidate = self._centred(image, candidate)
-        star = self._accepted(candidate)
+            spot = self._centred(image, spot)
+        star = self._accepted(spot)
         # A spot cut by the frame's edge has its centre of gravity away from the window's centre.
         return star if star is not None and star.off_centre_px <= 1.0 else None
 

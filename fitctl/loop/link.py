@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fitctl.config import ARCSEC_PER_RAD
 from fitctl.config import Loop as LoopSettings
 from fitctl.controllers.feedforward import link_matrix
-from fitctl.loop.metrology import MetrologyLoop
+from fitctl.loop.metrology import MetrologyLoop, newest_rad
 from fitctl.messages.modes import Mode
 from fitctl.model.hysteresis import play
 from fitctl.model.optics import AzEl, Scales
@@ -155,7 +155,7 @@ class Link:
 class BacklashFeedforward:
     """What the mirror makes up for: the plays of both siderostats, which their encoders do not see.
 
-    Only changes since :meth:`begin` count, so that nothing jumps. A backlash that the rig file does not
+    Only changes since :meth:`rest` count, so that nothing jumps. A backlash that the rig file does not
     know counts as none.
 
     Parameters
@@ -195,21 +195,30 @@ class BacklashFeedforward:
         self.offset_rad = offset_rad
         self._origin_rad = self._lost_rad - offset_rad
 
+    def rest(self, now_s: float, own: ServoState) -> None:
+        """Follow both plays; the mirror makes up for nothing that they have lost until now."""
+        self.follow(own)
+        self.begin(np.zeros(2))
+        self._in_force.append((now_s, self.offset_rad))
+
     def update(self, now_s: float, own: ServoState) -> None:
-        """Follow both plays from the encoders that this tick read; the mirror makes up for them from now on."""
+        """Follow both plays; the mirror makes up for them from now on."""
+        self.follow(own)
+        self.offset_rad = self._lost_rad - self._origin_rad
+        self._in_force.append((now_s, self.offset_rad))
+
+    def follow(self, own: ServoState) -> None:
+        """Follow both plays from the encoders that this tick read; the mirror stays as it is."""
         lost_rad = []
         servos = self._link.loop.servo_state, own
         for index, (stage, servo) in enumerate(zip(self._stages, servos, strict=True)):
-            read_rad = servo.position_rad if servo.reading is None else servo.reading.position_rad
             # Halfway between where the motors are and where they are to be at the next tick.
-            motor_rad = 0.5 * (np.array(read_rad) + stage.setpoint_rad)
+            motor_rad = 0.5 * (newest_rad(servo) + stage.setpoint_rad)
             beam_rad = play(self._beams_rad[index], motor_rad, self._half_rad[index])
             self._beams_rad[index] = beam_rad
             lost_rad.append(beam_rad - motor_rad)
         turned_rad = self._link.matrix @ lost_rad[0] + lost_rad[1]
         self._lost_rad = self._mirror_per_motor * turned_rad.dot(self._turn)
-        self.offset_rad = self._lost_rad - self._origin_rad
-        self._in_force.append((now_s, self.offset_rad))
 
     def at(self, time_s: float) -> Floats:
         """The offset in force at a recent time, shape (2,)."""

@@ -26,7 +26,7 @@ from fitctl.loop.following import Following
 from fitctl.loop.learning import Learning, is_other_light
 from fitctl.loop.link import BacklashFeedforward, Link
 from fitctl.loop.loop import Loop
-from fitctl.loop.metrology import MetrologyLoop
+from fitctl.loop.metrology import MetrologyLoop, newest_rad
 from fitctl.loop.observation import Observation
 from fitctl.loop.pointing import Pointing, error_from
 from fitctl.loop.quantities import StellarQuantities, stellar_places
@@ -92,7 +92,7 @@ class StellarLoop(Loop):
         scale = scales(rig, self.settings)
         self.star_motion = StarMotion(self.settings, scale, rig.camera.period_s)
         self.star_finder = StarFinder(rig, name, self.target_px, self._report_event)
-        self.search = StarSearch(rig, name, self.star_finder)
+        self.search = StarSearch(rig, name, self.star_finder, lambda: self.target_px)
         self.following = Following(self.settings, scale)
         self.pointing = Pointing(rig, name, self.target_px, design)
         self.learning = Learning(rig, name)
@@ -102,7 +102,10 @@ class StellarLoop(Loop):
         self._experiments = Experiments(name, scale.motor_px_per_rad, journal)
         self._tick_records = TickRecords(rig, name)
         self._flattened = self._held = False
+        self._search_rests = False, False  # for an interlock; for another loop
+        self._moved_s = journal.clock.now_s()
         self._search_due: bool | None = None  # whether it is for a star that was followed
+        self._asked_sky_rad = np.zeros(2)  # how far the sky had moved when the search was asked for
         self._rig_noise_px = sensor_noise_px(rig.camera, self.settings, self.settings.star_flux_dn)
         self._recalled: StarPlace | None = None  # until the devices are open
         self._held_undone_rad = np.zeros(2)  # of link and sky, as an experiment began
@@ -241,12 +244,38 @@ class StellarLoop(Loop):
         elif self._flattened and self.mode is Mode.VERNIER:
             self._start_pair(observation.beam_rad)
         self._flattened = flattens
+        waits = self._waits
         # Without a frame to track by, the stages wait where they are.
-        self._held = stopped or (
-            self.mode in TRACKING and (observation.frame is None or bool(self.waits_for))
-        )
+        self._held = stopped or waits or (self.mode in TRACKING and observation.frame is None)
+        self._rest_search(observation, stopped=stopped, waits=waits)
         if not self._held:
             self._laws[self.mode](observation)
+        self._follow_plays(observation)
+
+    @property
+    def _waits(self) -> bool:
+        """The loop waits for others, or is about to."""
+        due = self.mode is Mode.ACQUISITION and self._search_due is not None
+        return due or (self.mode in TRACKING and bool(self.waits_for))
+
+    def _rest_search(self, observation: Observation, *, stopped: bool, waits: bool) -> None:
+        """A siderostat that a search has sent far away stops on its way; for the search no time passes."""
+        passed_s, self._moved_s = observation.now_s - self._moved_s, observation.now_s
+        before, self._search_rests = self._search_rests, (False, False)
+        if self.mode is Mode.ACQUISITION and (stopped or waits):
+            self._search_rests = stopped, waits
+            self.search.delay(passed_s)
+            if self._search_rests != before:
+                self.siderostat.hold(newest_rad(observation.servo))
+
+    def _follow_plays(self, observation: Observation) -> None:
+        """The mirror makes up for backlash in VERNIER only, and then from where the plays are."""
+        if self.backlash is None:
+            return
+        if self.mode is not Mode.VERNIER:
+            self.backlash.rest(observation.now_s, observation.servo)
+        elif self._held or observation.star is None:
+            self.backlash.follow(observation.servo)
 
     @property
     def _is_stopped(self) -> bool:
@@ -286,7 +315,14 @@ class StellarLoop(Loop):
         ):
             return None  # what is seen on the way is another star
         follows = self.mode in FOLLOWING and self.following.lost == 0
-        return self.star_finder.find(frame.image, self.mode, beam_rad, mirror_rad, follows=follows)
+        is_pointed_at = self.star_finder.look_at_px is not None
+        again = self.search.again
+        star = self.star_finder.find(
+            frame.image, self.mode, beam_rad, mirror_rad, follows=follows, again=again
+        )
+        if is_pointed_at and star is not None:
+            self.following.begin()  # it may be another star than before
+        return star
 
     @property
     def spots(self) -> list[OtherLight]:
@@ -331,6 +367,7 @@ class StellarLoop(Loop):
                     other._stages_px_at(frame.mid_exposure_s),
                     follow=other.mode in FOLLOWING,
                     lost=other.observation.star is None and not other.waits_for,
+                    target_px=other.target_px,
                 )
                 for other in self.others
             }
@@ -364,13 +401,12 @@ class StellarLoop(Loop):
         super()._enter(source, motor_rad)
         if self.mode is Mode.ACQUISITION:
             self._search_due = source in FOLLOWING
+            self._asked_sky_rad = self.star_motion.sky_rad
             if not self._why_wait(self._clock.now_s(), motor_rad):
                 self._start_search(motor_rad)
         elif self.mode is Mode.COARSE:
             self.pointing.start_coarse(self.target_px)
         elif self.mode is Mode.VERNIER:
-            if self.backlash is not None:
-                self.backlash.begin(np.zeros(2))
             self._start_pair(self.star_motion.beam_rad(motor_rad))
 
     def _start_pair(self, beam_rad: Floats) -> None:
@@ -416,7 +452,7 @@ class StellarLoop(Loop):
         self.star_finder.estimator.expect(
             self.target_px, self.star_motion.beam_rad(motor_rad), np.zeros(2)
         )
-        self.search.start_where_expected(self.star_motion.sky_rad, again=again)
+        self.search.start_where_expected(self._asked_sky_rad, again=again)
 
     # ------------------------------------------------------------ the link, and other loops
 

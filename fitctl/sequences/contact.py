@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import uuid
 from collections.abc import Callable
@@ -17,6 +18,7 @@ from fitctl.messages.telemetry import Telemetry
 from fitctl.messages.waiting import RECEIVE_S, SILENCE_S
 from fitctl.sequences.links import Link
 from fitctl.sequences.view import SequenceError, View
+from fitctl.supervisor.sequence_board import SILENCE_S as FORGOTTEN_S
 
 MESSAGE_CHARS = 300
 _REPORT_S = 1.0
@@ -28,6 +30,10 @@ class Stopped(Exception):
     def __init__(self, message: str, *, release: bool) -> None:
         super().__init__(message)
         self.release = release
+
+
+class Forgotten(ConnectionError):
+    """The supervisor no longer knows this sequence; another one may be under way."""
 
 
 class Contact:
@@ -61,6 +67,7 @@ class Contact:
         self._on_status = on_status
         self._wanted = "run"
         self._reported_s = 0.0
+        self._accepted_s = -math.inf  # when the last report that was accepted was sent
 
     def begin(self) -> None:
         """Report to the supervisor that a sequence begins.
@@ -158,19 +165,27 @@ class Contact:
     def report(self, **changes: object) -> None:
         """Report to the supervisor where the sequence is, with what has changed of it.
 
+        A refused report is repeated with the next one: commands may exceed their rate for a moment. While the
+        supervisor knows this sequence, no other can begin.
+
         Raises
         ------
+        Forgotten
+            If it has accepted none for so long that it no longer knows this sequence.
         ConnectionError
-            If there is no supervisor, or it knows another sequence by now.
+            If there is no supervisor.
         """
         self.status = msgspec.structs.replace(self.status, **changes)
         reply = self._send_report()
-        if not reply.accepted:
+        if not reply.accepted and self._reported_s - self._accepted_s > FORGOTTEN_S:
             msg = f"the supervisor no longer knows this sequence: {reply.text}"
-            raise ConnectionError(msg)
+            raise Forgotten(msg)
         if changes:
             self._on_status(self.status)
 
     def _send_report(self) -> Reply:
         self._reported_s = self.link.now_s()
-        return self.link.send(SequenceReport(status=self.status))
+        reply = self.link.send(SequenceReport(status=self.status))
+        if reply.accepted:
+            self._accepted_s = self._reported_s
+        return reply

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
@@ -15,8 +16,8 @@ from fitctl.messages.modes import METROLOGY_MODES, STELLAR_MODES, Mode
 from fitctl.sequences.behaviours.behaviour import Behaviour, Calibration, Result
 from fitctl.sequences.behaviours.stars import evaluate, star_results, steps_of
 from fitctl.sequences.behaviours.table import BEHAVIOURS, loops_of, problems
-from fitctl.sequences.contact import MESSAGE_CHARS, Contact, Stopped
-from fitctl.sequences.steps import Collector, Standby, Star, Stars, Step
+from fitctl.sequences.contact import MESSAGE_CHARS, Contact, Forgotten, Stopped
+from fitctl.sequences.steps import Collector, CollectorScan, Off, Standby, Star, Stars, Step
 from fitctl.sequences.view import Figures, SequenceError, StepFailed, View
 
 _RETRY_S = 1.0  # between attempts
@@ -47,20 +48,24 @@ class Runner:
         self._link = contact.link
         self._rig = contact.rig
         self._star = ""  # of a list, that the step is for
-        self._moves_collector = False  # by a step of this sequence
+        self._may_move_collector = False  # a step may have begun a motion that none has ended
+        self._moving_since_s = math.inf  # if a motion goes on during the next steps
         self._motion_goes_on = motion_goes_on
 
     def hold_stages(self) -> None:
         """Stop tracking with every loop that had a step; one that does not track refuses, and may."""
-        with suppress(ConnectionError):
-            for name in self.contact.loops:
+        for name in self.contact.loops:
+            with suppress(ConnectionError):
                 self._link.send(Release(loop=name))
 
     def stop_collector(self, *, done: bool) -> None:
-        """Stop a motion of the collector that a step began."""
-        if self._moves_collector and not (done and self._motion_goes_on):
+        """Stop a motion of the collector that a step may have begun; without an answer, try once more."""
+        if not self._may_move_collector or (done and self._motion_goes_on):
+            return
+        for _ in range(2):
             with suppress(ConnectionError):
                 self._link.send(MoveCollector(action="stop"))
+                return
 
     def run(self, step: Step) -> SequenceAttempt:
         """Run one step, as often as it may be tried.
@@ -82,12 +87,21 @@ class Runner:
             self.contact.loops.update(dict.fromkeys(loop_names))
         if isinstance(step, Stars):
             return self._run_stars(step, loop_names[0], number)
-        if isinstance(step, Collector) and step.action == "stop":
-            self._moves_collector = False
+        if isinstance(step, Collector | CollectorScan):
+            return self._run_collector(step, loop_names[0], number)
         for loop_name in loop_names:
             record = self._try(lambda: step, loop_name, number)
-        if isinstance(step, Collector) and step.action == "start":
-            self._moves_collector = True
+        return record
+
+    def _run_collector(
+        self, step: Collector | CollectorScan, loop_name: str, number: int
+    ) -> SequenceAttempt:
+        """A step that watches the collector itself; a motion that it starts goes on during the next steps."""
+        self._may_move_collector, self._moving_since_s = True, math.inf
+        record = self._try(lambda: step, loop_name, number)
+        goes_on = isinstance(step, Collector) and step.action == "start"
+        self._may_move_collector = goes_on
+        self._moving_since_s = record.began_s if goes_on else math.inf
         return record
 
     def _run_stars(self, step: Stars, loop_name: str, number: int) -> SequenceAttempt:
@@ -156,6 +170,14 @@ class Runner:
                 behaviour.stop(step, view)
             outcome: Outcome = "timed out" if isinstance(failure, TimedOut) else "failed"
             return self._record(outcome, str(failure), {}, began_s)
+        except Forgotten:
+            raise  # the loops may be another sequence's by now
+        except ConnectionError:
+            if view is not None:
+                view.attempt = step.attempts  # no other follows
+                with suppress(ConnectionError):
+                    behaviour.stop(step, view)
+            raise
         except (Stopped, KeyboardInterrupt) as stopped:
             release = not isinstance(stopped, Stopped) or stopped.release
             with suppress(ConnectionError):
@@ -175,7 +197,7 @@ class Runner:
         while True:
             paused = behaviour.pausable and self.contact.pause_wanted
             self.contact.next(view, paused=paused)
-            self._require_motion(view)
+            self._require_motion(step, view)
             if paused or self.contact.show_pause(paused=False):
                 continue
             if view.now_s >= view.fresh_s:
@@ -186,13 +208,13 @@ class Runner:
                 msg = f"not done within {limit_s:g} s; loop {view.loop_name} is in {view.mode.name}"
                 raise TimedOut(msg)
 
-    def _require_motion(self, view: View) -> None:
-        """Refuse to go on with a collector that stands still where a step has it move."""
-        collector = view.telemetry.collector
-        if self._moves_collector and (collector is None or not collector.motion):
-            why = "" if collector is None else collector.error
-            msg = f"the collector no longer moves: {why or 'another person stopped it'}"
-            raise StepFailed(msg)
+    def _require_motion(self, step: Step, view: View) -> None:
+        """Refuse to go on with a collector that stands still where a step before has it move."""
+        if not isinstance(step, Off):
+            if self._moving_since_s < math.inf:
+                view.require_motion(self._moving_since_s)
+        elif all(loop.mode == Mode.OFF.name for loop in view.telemetry.loops):
+            self._moving_since_s = math.inf  # the supervisor stops the collector with the last loop
 
     def _wait_for_mode(self, step: Step, behaviour: Behaviour, view: View) -> None:
         begun_s = view.now_s

@@ -193,6 +193,27 @@ class View:
             msg = f"{failure.what} failed: {failure.text}"
             raise StepFailed(msg)
 
+    def require_motion(self, begun_s: float) -> None:
+        """Refuse to go on with a collector that stands still, though a step had it move from `begun_s` on.
+
+        Raises
+        ------
+        StepFailed
+            If it does; the text says why.
+        """
+        collector = self.telemetry.collector
+        if collector is not None and collector.motion:
+            return
+        error = "" if collector is None else collector.error
+        safe = [
+            f"loop {loop.name} is SAFE: {loop.why}, and that stops the collector"
+            for loop in self.telemetry.loops
+            if loop.mode == Mode.SAFE.name and loop.since_s >= begun_s
+        ]
+        why = error or next(iter(safe), "another person stopped it")
+        msg = f"the collector no longer moves: {why}"
+        raise StepFailed(msg)
+
     def update(self, telemetry: Telemetry, *, paused: bool) -> None:
         """Go on to the next message."""
         if paused:

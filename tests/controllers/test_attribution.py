@@ -15,7 +15,9 @@ from fitctl.controllers.attribution import (
 )
 
 RIG = default_rig_path().with_name("two-stars.toml")
-LOOKS_PX = look_places_px(load_rig(RIG), "right")
+CAMERA = load_rig(RIG).camera
+RIGHT_PX = np.array([28.0, 20.0])
+LOOKS_PX = look_places_px(CAMERA, RIGHT_PX, [np.array([12.0, 20.0])])
 seen = st.tuples(st.floats(3.0, 36.0), st.floats(3.0, 36.0))
 
 
@@ -38,11 +40,11 @@ def test_places_come_in_turn_as_candidates_are_rejected():
 @pytest.mark.parametrize(
     ("left_px", "places_px"),
     [
-        ("{az=12.0, el=20.0}", [(28.0, 20.0), (28.0, 29.0), (28.0, 11.0)]),
-        ("{az=28.0, el=4.0}", [(28.0, 20.0), (36.0, 20.0), (19.0, 20.0)]),
+        ((12.0, 20.0), [(28.0, 20.0), (28.0, 29.0), (28.0, 11.0)]),
+        ((28.0, 4.0), [(28.0, 20.0), (36.0, 20.0), (19.0, 20.0)]),
     ],
 )
 def test_they_lie_across_the_direction_of_the_other_target_and_on_the_frame(left_px, places_px):
-    found_px = look_places_px(load_rig(RIG, [f"loops.left.target_px={left_px}"]), "right")
+    found_px = look_places_px(CAMERA, RIGHT_PX, [np.array(left_px)])
     assert MOVE_PX == 9.0
     assert found_px == pytest.approx(np.array(places_px))

@@ -109,6 +109,14 @@ def test_a_hot_pixel_is_not_the_star(sensor, expose, hot_dn, with_star):
         assert star is None
 
 
+def test_many_hot_pixels_do_not_hide_a_dim_star(sensor, expose):
+    image = expose((24.0, 19.5))
+    for az_px in (3, 10, 17, 31, 37):
+        image[[3, 10, 29, 36], az_px] += 30_000
+    star = sensor.find(image)
+    assert (star.az_px, star.el_px) == pytest.approx((24.0, 19.5), abs=0.06)
+
+
 @pytest.mark.parametrize("hot_dn", [300, 8_000, 16_800, 28_000, 44_800, 64_000])
 def test_a_hot_pixel_in_the_window_is_not_held_for_the_star_that_has_gone(sensor, expose, hot_dn):
     image = expose(NOWHERE)

@@ -66,12 +66,16 @@ def test_a_step_of_background_in_the_window_is_taken_off(rig, tmp_path, level):
 def test_the_search_takes_no_hot_pixel_for_a_star_and_finds_the_star_beside_it(
     rig, tmp_path, level
 ):
-    hot = [HotPixel(az_px=5 + 4 * n, el_px=5, dn=20_000.0) for n in range(8)]
+    hot = [
+        HotPixel(az_px=5 + 4 * n, el_px=el_px, dn=20_000.0)
+        for n in range(8)
+        for el_px in (5, 9, 27, 31)
+    ]
     for pixel in hot:
         level[pixel.el_px, pixel.az_px] += pixel.dn
     image = frame(rig, *hot)
 
-    # More of them than are looked at: without the dark frame, the star is never reached.
+    # More of them than are passed over: without the dark frame, the star is never reached.
     assert StarSensor(rig.camera, rig.loops["right"]).find(image) is None
     star = StarSensor(with_dark(rig.camera, tmp_path, level), rig.loops["right"]).find(image)
     assert (star.az_px, star.el_px) == pytest.approx(STAR, abs=0.06)

@@ -530,3 +530,138 @@ def test_a_frozen_loop_that_lost_its_star_finds_it_again():
     one.laser(1.0)
     scene._flux_dn = light_dn
     one.until(metrology=Mode.LOCKED, left=Mode.VERNIER)
+
+
+FAR = {"expected_az_sky_arcsec": 900.0, "expected_el_sky_arcsec": 0.0}
+
+
+def sky_az_arcsec(loop):
+    return float(loop.servo.position_rad[0]) * loop.settings.siderostat.sky_arcsec_per_motor_rad
+
+
+def sent_far_away(held, **asked):
+    """Left is on its way to a search when its link is lost; where it is when it begins to wait."""
+    left = held.loop(LEFT)
+    assert held.command(Release(loop=LEFT)).accepted
+    held.run(0.5)
+    assert held.command(Acquire(loop=LEFT, **FAR, **asked)).accepted
+    held.run(0.1)
+    held.laser(0.0)
+    while not left.waits_for:
+        held.run(0.02)
+    assert left.mode is Mode.ACQUISITION
+    return sky_az_arcsec(left)
+
+
+@pytest.mark.long
+def test_a_siderostat_on_its_way_to_a_search_stops_when_its_link_is_lost_and_goes_on_with_it(held):
+    left, stopped_arcsec = held.loop(LEFT), sent_far_away(held, search_radius_sky_arcsec=20.0)
+    held.run(1.0)
+    assert sky_az_arcsec(left) == pytest.approx(stopped_arcsec, abs=25.0)  # it brakes and returns
+    assert abs(stopped_arcsec) < 500.0
+    held.run(left.search._slew_limit_s + 3.0)
+    assert sky_az_arcsec(left) == pytest.approx(stopped_arcsec, abs=25.0)
+    assert held.loop(LEFT).state(0.0).waits_for
+
+    held.laser(1.0)
+    held.until(limit_s=20.0, metrology=Mode.LOCKED)
+    held.until(limit_s=20.0, left=Mode.STANDBY)
+
+    assert "no star within 20 arcsec" in left.last_change.reason
+    assert abs(sky_az_arcsec(left)) > 800.0
+
+
+def test_a_candidate_is_looked_at_again_after_the_link_was_lost():
+    held = Testbed().held()
+    left = held.loop(LEFT)
+    held.command(Release(loop=LEFT))
+    held.run(0.5)
+    held.command(Acquire(loop=LEFT))
+    while left.star_finder.attribution.candidate is None:
+        held.run(0.02)
+    held.laser(0.0)
+    held.run(5.0)
+    assert left.waits_for
+    assert left.star_finder.attribution.candidate is not None
+
+    held.laser(1.0)
+    held.until(limit_s=20.0, left=Mode.COARSE)
+
+    assert not [e for e in held.events(LEFT) if "was not confirmed" in e.message]
+
+
+@pytest.mark.long
+def test_the_time_of_a_search_for_a_star_that_was_lost_does_not_run_while_it_waits():
+    held = Testbed("loops.left.acquisition.search_again_s=20.0").held()
+    uncover = held.darken(LEFT)
+    held.until(limit_s=2.0, left=Mode.ACQUISITION).run(2.0)
+    held.laser(0.0)
+    held.run(22.0)
+    assert held.loop(LEFT).waits_for
+
+    uncover()
+    held.laser(1.0)
+    held.until(limit_s=20.0, left=Mode.COARSE)
+
+
+@pytest.mark.parametrize("waited_s", [0.1, 20.0])
+@pytest.mark.long
+def test_a_place_that_a_command_gives_is_that_of_a_moving_star_when_it_is_given(waited_s):
+    moves = "loops.left.star_rate_sky_arcsec_s={az=12.0, el=-9.0}"
+    held = Testbed(moves, f"plant.{moves}").held()
+    left = held.loop(LEFT)
+    held.command(Release(loop=LEFT))
+    held.laser(0.0)
+    held.run(1.5)
+    on_target_rad = left.servo.position_rad + left._scale.motor_rad(
+        left.target_px - held.star_px(LEFT)
+    )
+    az, el = (-on_target_rad * left.settings.siderostat.sky_arcsec_per_motor_rad).tolist()
+    asked = Acquire(
+        loop=LEFT,
+        expected_az_sky_arcsec=az,
+        expected_el_sky_arcsec=el,
+        rate_az_sky_arcsec_s=12.0,
+        rate_el_sky_arcsec_s=-9.0,
+        search_radius_sky_arcsec=40.0,
+    )
+    assert held.command(asked).accepted
+    held.run(waited_s)
+
+    held.laser(1.0)
+    held.until(limit_s=20.0, left=Mode.COARSE)
+
+
+WITH_BACKLASH = (*UNEQUAL, "loops.left.feedforward.signal=encoders+backlash")
+
+
+def mirror_px(loop):
+    return loop.mirror.command_rad * loop._scale.mirror_px_per_rad
+
+
+@pytest.mark.long
+def test_what_the_plays_have_lost_before_the_star_is_held_moves_no_mirror():
+    testbed = Testbed(*WITH_BACKLASH)
+    testbed.simulation.acquire()
+    testbed.until(left=Mode.COARSE)
+    while testbed.loop(LEFT).mode is Mode.COARSE:
+        before_px = mirror_px(testbed.loop(LEFT))
+        testbed.run(0.02)
+    assert mirror_px(testbed.loop(LEFT)) == pytest.approx(before_px, abs=0.1)
+
+
+@pytest.mark.long
+def test_a_mirror_that_holds_a_star_again_has_no_offset_left_from_before():
+    testbed = Testbed(*WITH_BACKLASH).held()
+    testbed.swing(0.1)
+    testbed.run(3.0)
+    left = testbed.loop(LEFT)
+    offsets_px = np.abs(left.backlash.offset_rad) * left._scale.mirror_px_per_rad
+    assert offsets_px.max() > 0.02
+    testbed.drift(0.0)
+    testbed.command(Release(loop=LEFT))
+    testbed.run(1.0)
+    assert np.array_equal(left.backlash.at(testbed.clock.now_s()), np.zeros(2))
+    testbed.command(Acquire(loop=LEFT))
+    testbed.until(left=Mode.VERNIER)
+    assert np.array_equal(left.observation.backlash_rad, np.zeros(2))

@@ -27,8 +27,8 @@ def sine(amplitude_m, frequency_hz):
     return collector_m
 
 
-def bench(**options):
-    return Bench(**options)
+def bench(*overrides, **options):
+    return Bench(*overrides, **options)
 
 
 def events(of):
@@ -216,6 +216,27 @@ def test_a_search_ends_if_the_siderostat_does_not_come_to_its_middle():
     finding = search.evaluate(False, motor_rad, 1000.0)
     assert finding.trigger is Trigger.SEARCH_EXHAUSTED
     assert "did not reach the start of the search" in finding.reason
+
+
+def test_a_siderostat_on_its_way_to_a_search_stops_when_an_interlock_holds_it_and_goes_on_later():
+    row = "quantity='siderostat_travel_fraction', high=0.2, for_s=0.0, modes=['ACQUISITION']"
+    one = bench(
+        f"interlocks.far={{{row}, action='freeze', reset='hand'}}", offset_arcsec=(-600.0, 0.0)
+    )
+    one.diodes.light = 0.0
+    one.power_up().acquire(Acquire(expected_az_sky_arcsec=600.0, expected_el_sky_arcsec=0.0))
+    while not one.loop.interlocks.holds:
+        one.tick()
+    stopped_rad = one.motors.position_rad.copy()
+    one.run(one.loop.search._slew_limit_s + 3.0)
+    assert one.motors.position_rad == pytest.approx(stopped_rad, abs=1.5)  # it brakes and returns
+    assert one.loop.mode is Mode.ACQUISITION
+
+    one.loop.interlocks._rules["far"].high = 1.0
+    assert not one.loop.reset_interlock("far")
+    one.diodes.light = 1.0
+
+    one.until(Mode.LOCKED, limit_s=5.0)
 
 
 def test_after_a_jog_the_search_begins_where_the_siderostat_was_turned_to():

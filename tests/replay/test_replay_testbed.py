@@ -11,7 +11,15 @@ from samples.replay_courses import TIMEOUT, replayed
 from fitctl.config import default_rig_path, load_rig
 from fitctl.logging.errors import LogError
 from fitctl.logging.records import BeamPlace, Event, MetrologyTick, ModeChange, Overlap, Tick
-from fitctl.messages.commands import Acquire, Off, Recover, SetController, Standby, Stop
+from fitctl.messages.commands import (
+    Acquire,
+    Off,
+    Recover,
+    Release,
+    SetController,
+    Standby,
+    Stop,
+)
 from fitctl.messages.modes import Mode
 
 pytestmark = pytest.mark.long
@@ -110,6 +118,23 @@ def the_encoders_lose_their_zero(simulation):
     simulation.run(3.0)
 
 
+def a_search_waits_on_its_way(simulation):
+    """Left is on its way to a place far away when its link is lost; later it goes on."""
+    hold_all(simulation)
+    simulation.command(Release(loop="left"))
+    simulation.run(0.5)
+    far = Acquire(loop="left", expected_az_sky_arcsec=900.0, expected_el_sky_arcsec=0.0)
+    assert simulation.command(far).accepted
+    simulation.run(0.1)
+    laser(simulation, 0.0)
+    until(simulation, limit_s=1.0, metrology=Mode.ACQUISITION)
+    assert np.abs(simulation.supervisor.loops["left"].servo.position_rad).max() < 50.0
+    simulation.run(2.0)
+    laser(simulation, 1.0)
+    until(simulation, limit_s=15.0, metrology=Mode.LOCKED)
+    simulation.run(2.0)
+
+
 def a_beam_of_a_killed_supervisor(simulation):
     """The search begins where a supervisor before this one had not found its beam."""
     place = BeamPlace(
@@ -128,6 +153,7 @@ def a_beam_of_a_killed_supervisor(simulation):
 COURSES = {
     "a beam of a killed supervisor": (a_beam_of_a_killed_supervisor, [], {"BEAM_FOUND"}),
     "everything": (everything, [DRIFT], {"BEAM_LOST", "BEAM_FOUND", "IN_REACH", "STOP", "RECOVER"}),
+    "a search waits on its way": (a_search_waits_on_its_way, PLAYS, {"BEAM_LOST", "BEAM_FOUND"}),
     "plays": (hold_and_drift, [DRIFT, *PLAYS], {"BEAM_FOUND", "IN_REACH"}),
     "no sample can be read": (the_converter_fails("receive"), [], {"FAULT", "RECOVER"}),
     "no sample can be requested": (the_converter_fails("send_request"), [], {"FAULT", "RECOVER"}),

@@ -13,6 +13,7 @@ from fitctl.messages.modes import Mode
 from fitctl.model.compiled import numba_installed
 from fitctl.model.plant_constants import plant_constants
 from fitctl.simulation.batch.batch import Batch
+from fitctl.simulation.batch.laws import NOT_DUE
 from fitctl.simulation.batch.learning import Changes, RateChange
 from fitctl.simulation.batch.records import DONE, NOT_FOUND, REFUSED_COURSE
 from fitctl.simulation.batch.settings import BatchRefusalError
@@ -99,6 +100,13 @@ TIMELINE = (
             id="either spot is a star",
         ),
         pytest.param(["plant.loops.right.air_path.gain_px=6.0"], id="star lost and found"),
+        pytest.param(
+            [
+                "loops.right.flux_range={low=0.3, high=1.6}", "loops.right.other_spots=[]",
+                "plant.loops.right.air_path.gain_px=6.0",
+            ],
+            id="either spot is a star, which is lost and found",
+        ),
         pytest.param(["loops.right.acquisition.detection_sigma=4.0"], id="noise is looked at"),
         pytest.param(
             ["camera.frame_delay_s=0.055", CONTROLLER.format("minimum-variance")],
@@ -425,6 +433,32 @@ def test_a_beam_that_is_pulled_in_again_while_its_star_moves_makes_the_same_run(
     assert_same_loops(simulation, samples, run)
     modes = [mode for mode, _ in groupby(run.loops["metrology"].ticks["mode"].tolist())]
     assert [int(Mode.LOCKED), int(Mode.COARSE), int(Mode.LOCKED)] == modes[-3:]
+
+
+@pytest.mark.parametrize(
+    ("seed", "has_candidate"),
+    [
+        pytest.param(18, False, id="on the spiral"),
+        pytest.param(8, True, id="before the second look"),
+        pytest.param(28, True, id="twice"),
+    ],
+)
+def test_a_search_that_waits_for_its_link_rests_and_goes_on_in_the_same_way(seed, has_candidate):
+    rig = rig_of_testbed(
+        "collector.motion.kind=still",
+        "plant.loops.metrology.air_path.rms_sky_arcsec=100.0",
+        "loops.metrology.acquisition.search_again_pause_s=0.2",
+        "plant.loops.left.star_offset_sky_arcsec_max=150.0",
+    )
+
+    simulation, samples, run = both_of_all(rig, seed, 19.0)
+
+    assert run.ended == DONE
+    assert_same_loops(simulation, samples, run)
+    ticks = run.loops["left"].ticks
+    rests = (ticks["search_rests"] == 1) & (ticks["search_due"] == NOT_DUE)
+    assert rests.any()
+    assert (rests & (ticks["has_candidate"] == 1)).any() == has_candidate
 
 
 def test_a_link_that_turns_beyond_the_own_travel_and_back_makes_the_same_run():

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fitctl.config import HALF_WINDOW_PX, Rig
+from fitctl.config import HALF_WINDOW_PX, Camera
 from fitctl.controllers.attribution import (
     FOLLOWED_PX,
     MOST_STRANGERS,
@@ -33,6 +33,7 @@ class OtherStages(NamedTuple):
     moved_px: AzEl  # how far they, and a link's siderostat, move its star
     follow: bool  # its loop follows that star, which is then no candidate here
     lost: bool  # its loop does not find that star on the newest frame
+    target_px: Floats  # where its loop holds that star, shape (2,)
 
 
 class Attribution:
@@ -43,8 +44,7 @@ class Attribution:
 
     Parameters
     ----------
-    rig : Rig
-    loop_name : str
+    camera : Camera
     estimator : StarEstimator
 
     Attributes
@@ -53,10 +53,10 @@ class Attribution:
         As a frame first showed it, while the second look at it lasts.
     """
 
-    def __init__(self, rig: Rig, loop_name: str, estimator: StarEstimator) -> None:
+    def __init__(self, camera: Camera, estimator: StarEstimator) -> None:
         self.candidate: Star | None = None
         self._estimator = estimator
-        self._looks_px = look_places_px(rig, loop_name)
+        self._camera = camera
         self._strangers_px: deque[AzEl] = deque(maxlen=MOST_STRANGERS)
         self._rejected = 0
         self._last_stages_px = 0.0, 0.0
@@ -81,18 +81,13 @@ class Attribution:
             reach_px = PROVEN_PX
         elif mode is Mode.ACQUISITION:
             strangers = self._strangers_px
-        return min(
-            (
-                star
-                for star in candidates
-                if is_within(*star[:2], *expected_px, reach_px)
-                and not any(
-                    is_within(*star[:2], *place_px, HALF_WINDOW_PX) for place_px in strangers
-                )
-            ),
-            key=lambda star: math.dist(star[:2], expected_px),
-            default=None,
+        own = (
+            star
+            for star in candidates
+            if is_within(*star[:2], *expected_px, reach_px)
+            and not any(is_within(*star[:2], *place_px, HALF_WINDOW_PX) for place_px in strangers)
         )
+        return nearest(own, expected_px)
 
     def observe(self, star: Star, mode: Mode, stages_px: AzEl) -> None:
         """A frame shows `star`, exposed with the stages where they move a star by `stages_px`."""
@@ -107,11 +102,13 @@ class Attribution:
 
     # ------------------------------------------------------------ the second look
 
-    def propose(self, star: Star, others: Mapping[str, OtherStages]) -> Floats:
+    def propose(self, star: Star, target_px: Floats, others: Mapping[str, OtherStages]) -> Floats:
         """A frame shows a candidate: where the siderostat is to bring it, shape (2,)."""
         self.candidate, self._others = star, others
         self._estimator.suppose(star[:2], self._last_stages_px)
-        place_px: Floats = self._looks_px[second_look(self._looks_px, *star[:2], self._rejected)]
+        others_px = (other.target_px for other in others.values())
+        looks_px = look_places_px(self._camera, target_px, others_px)
+        place_px: Floats = looks_px[second_look(looks_px, *star[:2], self._rejected)]
         return place_px
 
     def has_moved(self, star: Star, others: Mapping[str, OtherStages]) -> bool:
@@ -146,3 +143,8 @@ class Attribution:
     def _drop(self) -> None:
         self.candidate = None
         self._estimator.withdraw()
+
+
+def nearest(stars: Iterable[Star], px: AzEl) -> Star | None:
+    """The star that is nearest to a place; None of none."""
+    return min(stars, key=lambda star: math.dist(star[:2], px), default=None)

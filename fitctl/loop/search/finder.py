@@ -8,11 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fitctl.config import Rig
+from fitctl.controllers.attribution import FOLLOWED_PX, is_within
 from fitctl.controllers.centroid import OtherLight, Star, StarSensor, moving_with_star
 from fitctl.controllers.estimator import StarEstimator
 from fitctl.logging.records import Severity
-from fitctl.loop.search.attribution import Attribution
-from fitctl.messages.modes import TRACKING, WITH_WINDOW, Mode
+from fitctl.loop.search.attribution import Attribution, nearest
+from fitctl.messages.modes import FOLLOWING, TRACKING, WITH_WINDOW, Mode
 from fitctl.model.optics import AzEl, scales
 
 Floats = NDArray[np.float64]
@@ -52,7 +53,7 @@ class StarFinder:
         self.estimator = StarEstimator(scales(rig, loop), target_px)
         self.attribution: Attribution | None = None
         if len(rig.stellar_loops) > 1:
-            self.attribution = Attribution(rig, loop_name, self.estimator)
+            self.attribution = Attribution(rig.camera, self.estimator)
         self.look_at_px: AzEl | None = None
         self.last: Star | None = None
         self._visible = False
@@ -103,19 +104,18 @@ class StarFinder:
         mirror_rad: Floats,
         *,
         follows: bool,
+        again: bool,
     ) -> Star | None:
         """The star on a frame that was exposed with the stages as given, each shape (2,).
 
-        Where it `follows`, the star is expected where it was; otherwise it may be anywhere.
+        Where it `follows`, the star was on the frame before; a search is made `again` for one that was lost.
         """
         stages_px = self.estimator.stages_px(motor_rad, mirror_rad)
         star = self._looked_for(image, mode)
-        if star is None and self.attribution is not None:
-            star = self._find_own(self.attribution, image, mode, stages_px, follows=follows)
-        elif star is None and follows:
-            star = self._sensor.follow(image, *self.estimator.predict_px(stages_px))
-        elif star is None:
-            star = self._sensor.find(image)
+        if star is None:
+            expected_px = self.estimator.predict_px(stages_px)
+            star = self._sensor.in_window(image, *expected_px) if follows else None
+            star = star or self._find_own(image, mode, expected_px, again=again)
         self.last, self._visible = star or self.last, star is not None
         if star is not None and self.attribution is not None:
             self.attribution.observe(star, mode, stages_px)
@@ -124,18 +124,21 @@ class StarFinder:
         return star
 
     def _find_own(
-        self,
-        attribution: Attribution,
-        image: NDArray[np.uint16],
-        mode: Mode,
-        stages_px: AzEl,
-        *,
-        follows: bool,
+        self, image: NDArray[np.uint16], mode: Mode, expected_px: AzEl, *, again: bool
     ) -> Star | None:
-        """The loop's own star on a frame on which other stars may be that look alike."""
-        expected_px = self.estimator.predict_px(stages_px)
-        star = self._sensor.in_window(image, *expected_px) if follows else None
-        return star or attribution.choose(self._sensor.candidates(image), mode, expected_px)
+        """The loop's own star on a whole frame, on which other stars may be that look alike.
+
+        One that is followed is near where it is expected; one that was lost probably is.
+        """
+        stars = self._sensor.candidates(image)
+        if self.attribution is not None:
+            return self.attribution.choose(stars, mode, expected_px)
+        if mode in FOLLOWING:
+            near = (star for star in stars if is_within(*star[:2], *expected_px, FOLLOWED_PX))
+            return nearest(near, expected_px)
+        if again and mode is Mode.ACQUISITION:
+            return nearest(stars, expected_px)
+        return next(stars, None)  # the brightest
 
     def _looked_for(self, image: NDArray[np.uint16], mode: Mode) -> Star | None:
         """The star at the place of a `look` command, if there is one."""

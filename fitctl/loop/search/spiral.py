@@ -243,6 +243,13 @@ class SpiralSearch:
             f"{self._slew_limit_s:.0f} s; check that its motors turn, then stop, recover and acquire again",
         )
 
+    def delay(self, duration_s: float) -> None:
+        """The search was kept waiting for `duration_s`, which does not count."""
+        self._since_s += duration_s
+        self._slews_since_s += duration_s
+        if self._candidate is not None:
+            self._candidate.since_s += duration_s
+
     def advance_from(self, motor_rad: Floats, beam_rad: Floats, duration_s: float) -> Floats:
         """As :meth:`advance`, but on the way to the spiral until the siderostat has arrived there."""
         if self._candidate is None and not self.has_arrived(motor_rad, beam_rad):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,14 +50,19 @@ class StarSearch(SpiralSearch):
     loop_name : str
     finder : StarFinder
         Knows where the star is expected, and where what a frame shows is.
+    read_target_px : callable
+        Reads where the loop holds its star now, shape (2,).
     """
 
-    def __init__(self, rig: Rig, loop_name: str, finder: StarFinder) -> None:
+    def __init__(
+        self, rig: Rig, loop_name: str, finder: StarFinder, read_target_px: Callable[[], Floats]
+    ) -> None:
         loop = rig.stellar_loops[loop_name]
         self._rig = rig
         self._loop_name = loop_name
         self._estimator, self._attribution = finder.estimator, finder.attribution
-        self._target_px = np.array([loop.target_px.az, loop.target_px.el])
+        self._zero_px = np.array([loop.target_px.az, loop.target_px.el])
+        self._read_target_px = read_target_px
         self._middle_px = np.array([rig.camera.width_px - 1, rig.camera.height_px - 1]) / 2
         scale = scales(rig, loop)
         self._scale = scale
@@ -95,14 +100,15 @@ class StarSearch(SpiralSearch):
     def start_where_expected(self, sky_rad: Floats, *, again: bool = False) -> None:
         """A new search, about where the star is expected now, or as a command asked.
 
-        The star has moved by itself by `sky_rad`, shape (2,), as an angle of the motors. With `again`, it was
-        followed until now: it is searched for in rounds, if the rig file allows it.
+        By the time of the command the star had moved by itself by `sky_rad`, shape (2,), as an angle of the
+        motors. With `again`, it was followed until now: it is searched for in rounds, if the rig file allows
+        it.
         """
         place_sky_arcsec, asked, self._asked = self.asked_place_sky_arcsec, self._asked, Acquire()
         if self._attribution is not None:
             self._attribution.begin_search()
         if place_sky_arcsec is not None:
-            place_px = self._target_px + self._scale.sky_px(place_sky_arcsec)
+            place_px = self._zero_px + self._scale.sky_px(place_sky_arcsec)
             self._estimator.place(place_px, sky_rad, np.zeros(2))
         self._overlap = asked.field_overlap
         # Two stars that were followed would lie on each other in the middle of the field.
@@ -139,7 +145,7 @@ class StarSearch(SpiralSearch):
         if attribution.candidate is None:
             if star is None:
                 return self.look(False, self.centre_rad, now_s)
-            place_px = attribution.propose(star, others)
+            place_px = attribution.propose(star, self._read_target_px(), others)
             return self.look(True, self._estimator.motor_for_rad(place_px, np.zeros(2)), now_s)
         has_moved = star is not None and attribution.has_moved(star, others)
         finding = self.look(has_moved, self.centre_rad, now_s)
@@ -156,7 +162,7 @@ class StarSearch(SpiralSearch):
             self._attribution.begin_round()
 
     def _star_on_target_rad(self) -> Floats:
-        return self._estimator.motor_for_rad(self._target_px, np.zeros(2))
+        return self._estimator.motor_for_rad(self._read_target_px(), np.zeros(2))
 
     def _star_in_the_middle_rad(self) -> Floats:
         """With the star in the middle of the field, the search sees farthest."""

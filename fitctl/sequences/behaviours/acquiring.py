@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import numpy as np
 
 from fitctl.config import Rig
@@ -39,7 +40,6 @@ def search_of(step: steps.Acquire, rig: Rig, loop_name: str, attempt: int) -> Ac
         first = radius or rig.loops[loop_name].acquisition.search_radius_sky_arcsec
         radius = min(first * step.radius_growth ** (attempt - 1), step.max_offset_sky_arcsec)
     return Acquire(
-        # Without a loop, all of them search at once: each then leaves the others' stars alone.
         loop=step.loop,
         search_radius_sky_arcsec=radius,
         field_overlap=step.field_overlap,
@@ -92,8 +92,32 @@ def _run(step: steps.Acquire, view: View) -> None:
 
 
 def _search(step: steps.Acquire, view: View) -> None:
-    view.command(search_of(step, view.rig, view.loop_name, view.attempt))
+    search = search_of(step, view.rig, view.loop_name, view.attempt)
+    # Without a loop, all of them search at once: each then leaves the others' stars alone. A search of another
+    # loop that is under way does not begin anew.
+    if view.attempt > 1 or _searching(view):
+        search = msgspec.structs.replace(search, loop=view.loop_name)
+    view.command(search)
     view.marks.append(view.fresh_s)
+
+
+def _searching(view: View) -> list[str]:
+    """The other loops that search, but not again for a star that they lost."""
+    return [
+        loop.name
+        for loop in view.telemetry.loops
+        if loop.name != view.loop_name
+        and loop.mode == Mode.ACQUISITION.name
+        and loop.search_again is None
+    ]
+
+
+def _stop(step: steps.Acquire, view: View) -> None:
+    """End the search, and with the last attempt those of all loops that the step began."""
+    stop_tracking(step, view)
+    if not step.loop and view.attempt >= step.attempts:
+        for name in _searching(view):
+            view.ask(Release(loop=name))
 
 
 def _done(step: steps.Acquire, view: View) -> Result | None:
@@ -133,7 +157,7 @@ ACQUIRE = {
         frozenset({Mode.OFF, Mode.STANDBY, Mode.ACQUISITION, Mode.COARSE, *HOLDING}),
         _done,
         _run,
-        stop_tracking,
+        _stop,
         _check,
         _own_s,
         loops="links first",

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from fitctl.config import Rig
 from fitctl.controllers.pair import LEARNT
+from fitctl.messages.command_table import ROWS
 from fitctl.messages.commands import Off, Release, SetController, Standby
 from fitctl.messages.modes import Mode
 from fitctl.sequences import steps
 from fitctl.sequences.behaviours.behaviour import ANY, POWERED, Behaviour, Result, stop_tracking
-from fitctl.sequences.view import View
+from fitctl.sequences.view import StepFailed, View
+
+_OFF = ROWS[Off].word
 
 
 def _run_standby(_step: steps.Standby, view: View) -> None:
@@ -60,9 +63,17 @@ def _wait_done(step: steps.Wait, view: View) -> Result | None:
 
 
 def _off_done(_step: steps.Off, view: View) -> Result | None:
+    """The mode is OFF from the start of closing; devices that were not closed cannot be closed again."""
+    failure = view.loop.last_failure
+    if failure is not None and failure.what == _OFF:
+        msg = f"{_OFF} failed: {failure.text}"
+        raise StepFailed(msg)
     if view.mode is Mode.STANDBY:
         view.ask(Off(loop=view.loop_name))  # refused while the mirror is on its way to its bias
-    return Result({}, "") if view.mode is Mode.OFF else None
+    closing = any(
+        outcome.command == _OFF and outcome.state == "under way" for outcome in view.loop.outcomes
+    )
+    return Result({}, "") if view.mode is Mode.OFF and not closing else None
 
 
 def _wait_s(step: steps.Wait, _rig: Rig, _loop_name: str) -> float:

@@ -23,7 +23,7 @@ from fitctl.sequences.view import StepFailed, View, columns
 _DIRECTIONS_DEG = (0.0, 90.0)  # azimuth and elevation of the link
 _LEAST_SAMPLES = 100
 _REST_S = 1.0  # at the ends of a scan; a hexapod that was stopped slows down meanwhile
-_JOGS = 10  # between two looks at the telemetry
+_PART_OF_COMMANDS = 0.5  # of those that one person may send: reports and people need the rest
 AzElArcsec = tuple[float, float]
 
 
@@ -115,9 +115,7 @@ def _collector_scan_done(step: steps.CollectorScan, view: View) -> Result | None
             f"scanned along both axes, the star within az {az_px:.3f}, el {el_px:.3f} px RMS"
             f"{_log_hint(view, 'feedforward')}",
         )
-    if not collector.motion:
-        msg = "the collector no longer moves: another person stopped it"
-        raise StepFailed(msg)
+    view.require_motion(view.marks[-1])
     if view.now_s - view.marks[-1] >= _scan_s(step):
         view.command(MoveCollector(action="stop"))
         view.rows["stops"].append((view.now_s,))
@@ -167,10 +165,11 @@ def _check_beam_scan(step: steps.BeamScan, rig: Rig, loop_name: str) -> list[str
     if step.slow_sky_arcsec_s > step.fast_sky_arcsec_s / 2:
         problems.append("slow_sky_arcsec_s must be at most half of fast_sky_arcsec_s")
     most_arcsec = min(rig.camera.width_px, rig.camera.height_px) / sky_px_per_rad(rig)
-    # Between two looks at the telemetry the beam waits for the next message.
-    jog_arcsec = step.fast_sky_arcsec_s * (2 / rig.supervisor.telemetry_hz)
+    jog_arcsec = step.fast_sky_arcsec_s * 2 * _jog_period_s(rig)
     if jog_arcsec > most_arcsec * ARCSEC_PER_RAD:
-        problems.append("fast_sky_arcsec_s is too fast for the pace of the telemetry; lower it")
+        problems.append(
+            "fast_sky_arcsec_s is too fast for the pace of the telemetry and of commands; lower it"
+        )
     return problems
 
 
@@ -184,13 +183,14 @@ def _run_beam_scan(_step: steps.BeamScan, view: View) -> None:
 
 
 def _beam_scan_done(step: steps.BeamScan, view: View) -> Result | None:
-    """Some jogs, one for each frame, so that the motors do not stop and pass their set-points at each."""
+    """A jog for each message, or fewer, if more would be too many commands."""
     view.require_mode(Mode.STANDBY)
     _require_still(view)
     if not view.marks:
-        view.marks += [view.now_s, 0.0, 0.0]  # when it began, and how far the beam was moved
+        # When it began, how far the beam was moved, and when it was moved last.
+        view.marks += [view.now_s, 0.0, 0.0, -math.inf]
     corners = beam_course(step)
-    for _ in range(_JOGS):
+    if view.link.now_s() - view.marks[3] >= _least_period_s(view.rig):
         _follow_course(view, corners)
     since_s = view.link.now_s() - view.marks[0]
     _record_volts(view)
@@ -208,8 +208,9 @@ def _beam_scan_done(step: steps.BeamScan, view: View) -> Result | None:
 
 
 def _follow_course(view: View, corners: list[tuple[float, AzElArcsec]]) -> None:
-    """Move the beam to where it is to be a frame from now; the answer comes with the next frame."""
-    since_s = view.link.now_s() - view.marks[0] + view.rig.camera.period_s
+    """Move the beam to where it is to be at the next jog."""
+    jogged_s = view.link.now_s()
+    since_s = jogged_s - view.marks[0] + _jog_period_s(view.rig)
     az_arcsec, el_arcsec = _place_at(corners, since_s)
     view.command(
         Jog(
@@ -218,7 +219,17 @@ def _follow_course(view: View, corners: list[tuple[float, AzElArcsec]]) -> None:
             el_sky_arcsec=el_arcsec - view.marks[2],
         )
     )
-    view.marks[1:] = [az_arcsec, el_arcsec]
+    view.marks[1:] = [az_arcsec, el_arcsec, jogged_s]
+
+
+def _least_period_s(rig: Rig) -> float:
+    """Between two jogs."""
+    return 1 / (_PART_OF_COMMANDS * rig.service.commands_per_s)
+
+
+def _jog_period_s(rig: Rig) -> float:
+    """Between two jogs, each of which follows a message of the telemetry."""
+    return max(1 / rig.supervisor.telemetry_hz, _least_period_s(rig))
 
 
 def _require_still(view: View) -> None:

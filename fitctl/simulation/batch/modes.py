@@ -30,7 +30,7 @@ from fitctl.simulation.batch.laws import (
     start_pair,
 )
 from fitctl.simulation.batch.sensor import stages_px
-from fitctl.simulation.batch.siderostat import motor_px, motor_rad, undo_turn
+from fitctl.simulation.batch.siderostat import motor_px, motor_rad, siderostat_to, undo_turn
 
 OFF, STANDBY, LOCKED = int(Mode.OFF), int(Mode.STANDBY), int(Mode.LOCKED)
 ACQUIRE, POWER_UP = int(Trigger.ACQUIRE), int(Trigger.STANDBY)
@@ -239,6 +239,22 @@ def evaluate_waiting(ss: Any, rr: Any, i: int) -> None:
             start_pair(s, r, r.beam_rad[0], r.beam_rad[1])
     if r.mode == ACQUISITION and r.search_due != NOT_DUE:
         start_search(s, r, rr, r.motor_rad[0], r.motor_rad[1])
+
+
+@compilable()
+def rest_search(s: Any, r: Any) -> bool:
+    """``StellarLoop._rest_search``; whether the loop waits."""
+    passed_s, r.moved_s = r.now_s - r.moved_s, r.now_s
+    waits = bool(r.waits or (r.mode == ACQUISITION and r.search_due != NOT_DUE))
+    rested, r.search_rests = r.search_rests, 1 if waits and r.mode == ACQUISITION else 0
+    if r.search_rests:
+        r.search_since_s += passed_s
+        if r.has_candidate:
+            r.candidate.since_s += passed_s
+        if not rested:
+            siderostat_to(s, r, r.position_rad[0], r.position_rad[1])
+            r.beyond_rad[0] = r.beyond_rad[1] = 0.0
+    return waits
 
 
 @compilable()

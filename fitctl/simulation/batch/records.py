@@ -93,6 +93,7 @@ STAR = np.dtype(
         ("exposed_mirror_rad", "f8", (2,)),
         ("has_arrived", "i8"),
         ("star_visible", "i8"),
+        ("last_visible", "i8"),  # on the last frame on which it was looked for
         ("star_px", "f8", (2,)),
         ("flux_dn", "f8"),
         # Following
@@ -109,6 +110,8 @@ STAR = np.dtype(
         # the link, and waiting for it or for other loops
         ("waits", "i8"),
         ("search_due", "i8"),
+        ("search_rests", "i8"),
+        ("moved_s", "f8"),
         ("link_counts", "i8"),
         ("beam_rad", "f8", (2,)),
         ("link_motor_rad", "f8", (2,)),

@@ -36,6 +36,7 @@ from fitctl.simulation.batch.modes import (
     follow_sky,
     linked_rad,
     observe,
+    rest_search,
     use_design,
 )
 from fitctl.simulation.batch.plant import (
@@ -151,7 +152,7 @@ def tick_star(
     if s.link >= 0:
         follow_link(s, r, rr)
     follow_sky(s, r, rr)
-    if not r.waits:
+    if not rest_search(s, r):
         command(s, r, w)
         r.later_s = exposed_s + s.later_after_s
     return True
@@ -169,6 +170,7 @@ def wait_for_frame(ss: Any, rr: Any, ww: Any, i: int) -> None:
     if s.link >= 0:
         follow_link(s, r, rr)
     follow_sky(s, r, rr)
+    rest_search(s, r)
 
 
 @compilable()

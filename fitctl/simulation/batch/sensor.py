@@ -14,6 +14,7 @@ from fitctl.controllers.centroid import (
     EDGE_PX,
     LARGEST_PEAK,
     MAX_CANDIDATES,
+    MOST_HOT,
     REACH_DIAMETERS,
     window_centre,
 )
@@ -82,6 +83,8 @@ def fitted(s: Any, window_dn: Floats, az_px: float, el_px: float) -> tuple[float
             return math.nan, math.nan
         az_px = (column - NODES) / STEPS_PER_PX + az_moment / light
         el_px = (row - NODES) / STEPS_PER_PX + el_moment / light
+    if max(abs(az_px), abs(el_px)) > HALF_WINDOW_PX:
+        return math.nan, math.nan
     return az_px, el_px
 
 
@@ -135,7 +138,7 @@ def subtract_others(ss: Any, rr: Any, w: Any, i: int, window_az: int, window_el:
                 first_column, az_px, s.followed_sigma_px, s.light, w.across
             )
             top, bottom = light_fractions(first_row, el_px, s.followed_sigma_px, s.light, w.down)
-            flux_dn = s.followed_part[spot] * r.flux_dn * r.star_visible
+            flux_dn = s.followed_part[spot] * r.flux_dn * r.last_visible
             for row in range(top, bottom):
                 for column in range(left, right):
                     w.window_dn[row, column] -= flux_dn * w.down[row] * w.across[column]
@@ -144,14 +147,14 @@ def subtract_others(ss: Any, rr: Any, w: Any, i: int, window_az: int, window_el:
 @compilable()
 def accept(r: Any, az_px: float, el_px: float, flux_dn: float) -> None:
     """The star is on the frame."""
-    r.star_visible = 1
+    r.star_visible = r.last_visible = 1
     r.star_px[0], r.star_px[1] = az_px, el_px
     r.flux_dn = flux_dn
 
 
 @compilable()
 def measure(ss: Any, rr: Any, ww: Any, i: int, window_az: int, window_el: int) -> bool:
-    """``StarSensor.measure``; False where the whole frame must decide (``StarSensor.follow``)."""
+    """``StarSensor.in_window``; False where the whole frame must decide."""
     s, r, w = ss.stars[i], rr.stars[i], ww.stars[i]
     first_row, first_column = window_el - HALF_WINDOW_PX, window_az - HALF_WINDOW_PX
     render(
@@ -184,10 +187,14 @@ def centroid_on(
 
 
 @compilable()
-def may_be_own(r: Any, az_px: float, el_px: float, near_az_px: float, near_el_px: float) -> bool:
-    """What ``Attribution.choose`` does not leave out."""
+def may_be_own(
+    s: Any, r: Any, az_px: float, el_px: float, near_az_px: float, near_el_px: float
+) -> bool:
+    """What ``StarFinder._find_own`` and ``Attribution.choose`` do not leave out."""
     if r.mode != ACQUISITION:
         return is_within(az_px, el_px, near_az_px, near_el_px, FOLLOWED_PX)
+    if not s.shared:
+        return True
     if r.has_candidate:
         return is_within(az_px, el_px, near_az_px, near_el_px, PROVEN_PX)
     for stranger in range(min(r.strangers, MOST_STRANGERS)):
@@ -199,7 +206,7 @@ def may_be_own(r: Any, az_px: float, el_px: float, near_az_px: float, near_el_px
 
 @compilable()
 def find(ss: Any, rr: Any, ww: Any, i: int, frame_dn: Floats, search_dn: Floats) -> None:
-    """``StarSensor.find`` over a whole frame, or ``Attribution.choose`` where the frame is shared."""
+    """``StarFinder._find_own``: the nearest, or in the first search of a loop alone the brightest."""
     s, r, w = ss.stars[i], rr.stars[i], ww.stars[i]
     stages_az_px, stages_el_px = stages_px(s, r)
     near_az_px, near_el_px = r.star_origin_px[0] + stages_az_px, r.star_origin_px[1] + stages_el_px
@@ -210,26 +217,28 @@ def find(ss: Any, rr: Any, ww: Any, i: int, frame_dn: Floats, search_dn: Floats)
         search_dn[:, 0], search_dn[0],
     )  # fmt: skip
     search_dn[:] = frame_dn
-    for _ in range(MAX_CANDIDATES):
+    spots = 0
+    for _ in range(MAX_CANDIDATES + MOST_HOT):
         el, az = divmod(np.argmax(search_dn), s.width_px)
-        if search_dn[el, az] - s.bias_dn < s.sensor.threshold_dn:
+        if search_dn[el, az] - s.bias_dn < s.sensor.threshold_dn or spots == MAX_CANDIDATES:
             return
         window_az, window_el = (
             window_centre(az, s.sensor.largest_az_px),
             window_centre(el, s.sensor.largest_el_px),
         )
         az_px, el_px, flux = centroid_on(ss, rr, ww, i, frame_dn, window_az, window_el)
-        if flux > 0:
+        if not math.isnan(az_px):
+            spots += 1
             window_az = window_centre(az_px, s.sensor.largest_az_px)
             window_el = window_centre(el_px, s.sensor.largest_el_px)
             az_px, el_px, flux = centroid_on(ss, rr, ww, i, frame_dn, window_az, window_el)
         centred = abs(az_px - window_az) <= 1.0 and abs(el_px - window_el) <= 1.0
         if centred and is_own_star(ss, rr, i, az_px, el_px, flux):
-            if not s.shared:
+            if r.mode == ACQUISITION and not s.shared and not r.again:
                 accept(r, az_px, el_px, flux)
                 return
             away_px = math.hypot(az_px - near_az_px, el_px - near_el_px)
-            if away_px < nearest_px and may_be_own(r, az_px, el_px, near_az_px, near_el_px):
+            if away_px < nearest_px and may_be_own(s, r, az_px, el_px, near_az_px, near_el_px):
                 accept(r, az_px, el_px, flux)
                 nearest_px = away_px
         top, left = max(0, el - HALF_WINDOW_PX), max(0, az - HALF_WINDOW_PX)
@@ -289,6 +298,7 @@ def sense(ss: Any, rr: Any, ww: Any, i: int) -> int:
     r.star_visible = 0
     if r.mode == ACQUISITION and (r.search_due != NOT_DUE or r.waits or not has_arrived(s, r)):
         return SENSED
+    r.last_visible = 0
     if follows(r):
         az_px, el_px = stages_px(s, r)
         az = window_centre(r.star_origin_px[0] + az_px, s.sensor.largest_az_px)

@@ -86,6 +86,11 @@ def star_settings(
     again_s = acquisition.search_again_s
     scale, plan = scales(rig, loop), plan_spiral(rig, loop_name)
     target_px = np.array([loop.target_px.az, loop.target_px.el])
+    other_targets_px = [
+        np.array([other.target_px.az, other.target_px.el])
+        for name, other in rig.stellar_loops.items()
+        if name != loop_name
+    ]
     sensor, mirror = StarSensor(camera, loop), Mirror(fsm)
     pointing = Pointing(rig, loop_name, target_px, design_for(rig, loop_name))
     pair = pointing.pair
@@ -172,7 +177,7 @@ def star_settings(
             "middle_px": np.array([camera.width_px - 1, camera.height_px - 1]) / 2,
             "target_px": target_px,
             "shared": len(rig.stellar_loops) > 1,
-            "looks_px": look_places_px(rig, loop_name),
+            "looks_px": look_places_px(rig.camera, target_px, other_targets_px),
             "scale": _fields(
                 scale,
                 "motor_px_per_rad",

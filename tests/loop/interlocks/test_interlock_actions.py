@@ -12,6 +12,7 @@ from interlock_bench import Bench, late_frames, servo_that_skips, struck
 from fitctl.config import QUANTITIES
 from fitctl.daemon.machine import Machine, wall_minus_monotonic_s
 from fitctl.messages.commands import (
+    Acquire,
     Experiment,
     Off,
     Recover,
@@ -57,6 +58,32 @@ def test_flattened_the_mirror_is_at_its_bias_and_the_siderostat_held_until_it_is
     assert not bench.loop.tick_record().held
     errors = [tick.error_az_px for tick in bench.simulation.ticks[-250:]]
     assert abs(np.mean(errors)) < 0.05
+
+
+@pytest.mark.parametrize("action", ["freeze", "flatten"])
+def test_a_siderostat_on_its_way_to_a_search_stops_and_goes_on_after_the_reset(action):
+    row = {"quantity": "'siderostat_travel_fraction'", "high": 0.2, "for_s": 0.0,
+           "modes": "['ACQUISITION']", "action": f"'{action}'", "reset": "'hand'"}  # fmt: skip
+    bench = Bench("interlocks.far={" + ", ".join(f"{k}={v}" for k, v in row.items()) + "}")
+    servo, siderostat = bench.loop.servo, bench.loop.siderostat
+    asked = Acquire(
+        expected_az_sky_arcsec=900.0, expected_el_sky_arcsec=0.0, search_radius_sky_arcsec=20.0
+    )
+    assert bench.simulation.command(Release()).accepted
+    assert bench.simulation.command(asked).accepted
+    assert bench.until(lambda: bench.tripped, 2.0)
+    stopped_rad = servo.position_rad
+    bench.run(bench.loop.search._slew_limit_s + 3.0)
+    assert bench.loop.tick_record().held
+    assert np.abs(servo.position_rad - stopped_rad).max() < 0.02 * siderostat.travel_rad
+    assert bench.loop.mode is Mode.ACQUISITION
+
+    bench.loop.interlocks._rules["far"].high = 1.0
+    assert bench.simulation.command(Reset(name="far")).accepted
+
+    assert bench.until(lambda: bench.loop.mode is Mode.STANDBY, 10.0)
+    assert "no star within 20 arcsec" in bench.loop.last_change.reason
+    assert np.abs(servo.position_rad).max() > 0.7 * siderostat.travel_rad
 
 
 @pytest.mark.parametrize("action", ["freeze", "flatten"])

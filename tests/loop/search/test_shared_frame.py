@@ -211,6 +211,31 @@ def test_a_star_that_shows_only_on_the_other_half_of_the_frame_does_not_disturb_
     held.assert_both_held()
 
 
+@pytest.mark.parametrize("again", [True, False])
+def test_a_star_is_not_brought_to_where_the_target_was_and_another_loop_holds_its_star(held, again):
+    held.command(SetTarget(loop=RIGHT, az_px=28.0, el_px=8.0))
+    held.run(8.0)
+    held.command(SetTarget(loop=LEFT, az_px=28.0, el_px=20.0))
+    held.run(12.0)
+    since_s = held.clock.now_s()
+    if again:
+        held.light(right=0.0, left=1.0)
+        held.until(RIGHT, Mode.ACQUISITION)
+        held.run(1.0)
+        held.light(right=1.0, left=1.0)
+    else:
+        held.command(Release(loop=RIGHT))
+        held.run(1.0)
+        held.command(Acquire(loop=RIGHT))
+    held.until(RIGHT, Mode.VERNIER)
+    held.run(5.0)
+
+    changes = [change for change in held.mode_changes if change.time_s > since_s]
+    assert {change.loop for change in changes} == {RIGHT}
+    assert held.star_px(RIGHT) == pytest.approx((28.0, 8.0), abs=0.5)
+    assert held.star_px(LEFT) == pytest.approx((28.0, 20.0), abs=0.5)
+
+
 def test_a_target_is_of_one_loop_so_that_two_stars_are_not_sent_to_one_place():
     simulation = TwoStars()
     targets_px = {name: simulation.loop(name).target_px.tolist() for name in TARGET_PX}

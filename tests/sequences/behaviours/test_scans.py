@@ -14,7 +14,7 @@ from fitctl.identify.experiments import EXPERIMENTS
 from fitctl.identify.link.step_record import gather_step
 from fitctl.logging.records import MetrologyTick, SequenceAttempt, Tick
 from fitctl.logging.writer import LogWriter
-from fitctl.messages.commands import Jog, MoveCollector
+from fitctl.messages.commands import Jog, MoveCollector, Stop
 from fitctl.model.optics import rotation
 from fitctl.sequences.behaviours.scans import beam_course
 from fitctl.sequences.behaviours.table import problems
@@ -118,6 +118,53 @@ def test_a_scan_fails_where_somebody_stops_the_collector(testbed):
     assert "the collector no longer moves: another person stopped it" in run.error
 
 
+def test_a_scan_names_the_loop_whose_safe_stopped_the_collector(testbed):
+    run = testbed()
+    run.link.meddling = [(30.0, Stop(loop="right"))]
+    metrology, left = ({"step": "acquire", "loop": name} for name in ("metrology", "left"))
+    run(REFERENCE, metrology, left, {**SCAN, "cycles": 10})
+    expected = "no longer moves: loop right is SAFE: operator, and that stops the collector"
+    assert run.error.endswith(expected)
+
+
+def test_a_scan_whose_answer_is_lost_leaves_no_collector_moving(testbed):
+    def lose_the_next(link):
+        send = link.send
+
+        def sends(_command):
+            link.send = send
+            msg = "no answer within 2 s"
+            raise ConnectionError(msg)
+
+        assert link.receive(1.0).collector.motion
+        link.send = sends
+
+    run = testbed()
+    run.link.meddling = [(30.0, lose_the_next)]
+    with pytest.raises(ConnectionError):
+        run(REFERENCE, {"step": "acquire"}, {**SCAN, "cycles": 10})
+    assert not run.link.receive(1.0).collector.motion
+
+
+def test_jogs_use_at_most_half_of_the_commands_that_one_person_may_send(testbed):
+    run, jogged_s = testbed("camera.frame_rate_hz=100.0", "camera.exposure_s=0.005"), []
+    send = run.link.send
+
+    def sends(command):
+        if isinstance(command, Jog):
+            jogged_s.append(run.link.now_s())
+        return send(command)
+
+    run.link.send = sends
+    quick = {"span_sky_arcsec": 60.0, "slow_sky_arcsec_s": 40.0, "cycles": 1}
+    run(
+        {"step": "standby", "loop": "metrology"},
+        {"step": "beam_scan", "loop": "metrology", **quick},
+    )
+    assert run.outcomes() == ["done", "done"]
+    assert np.diff(jogged_s).min() >= 2 / run.rig.service.commands_per_s - 1e-9
+
+
 def test_photodiodes_and_link_delay_are_found_from_a_scan_of_the_beam(testbed):
     run = testbed(
         "plant.loops.metrology.sensor.beam_radius_m=0.026",
@@ -193,6 +240,9 @@ def test_what_is_wrong_is_one_line_before_anything_moves():
     assert wide == "span_sky_arcsec must be at most 1500, the siderostat's travel_sky_arcsec"
     (wild,) = wrong_with("beam_scan", loop="metrology", fast_sky_arcsec_s=5000.0)
     assert "too fast for the pace of the telemetry" in wild
+    few = load_rig(RIGS / "fit-testbed.toml", ["service.commands_per_s=5.0"])
+    (slow,) = wrong_with("beam_scan", few, loop="metrology")
+    assert "too fast for the pace of the telemetry and of commands" in slow
 
 
 def test_only_the_last_attempt_that_was_done_counts():

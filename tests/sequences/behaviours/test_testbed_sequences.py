@@ -100,6 +100,30 @@ def test_a_step_fails_where_somebody_else_stops_the_collector(testbed):
     assert "the collector no longer moves: another person stopped it" in testbed.error
 
 
+def test_a_step_names_the_loop_whose_safe_stopped_the_collector(testbed):
+    testbed.link.meddling = [(8.0, Stop(loop="right"))]
+    testbed(
+        {"step": "standby", "loop": "left"}, REFERENCE, SINE, {"step": "wait", "duration_s": 30.0}
+    )
+    assert testbed.outcomes() == ["done"] * 3 + ["failed"]
+    expected = "no longer moves: loop right is SAFE: operator, and that stops the collector"
+    assert testbed.error.endswith(expected)
+
+
+def test_a_loop_that_was_safe_before_the_motion_did_not_stop_the_collector(testbed):
+    assert testbed.link.send(Stop(loop="right")).accepted
+    testbed.link.meddling = [(8.0, MoveCollector(action="stop"))]
+    testbed(REFERENCE, SINE, {"step": "wait", "duration_s": 30.0})
+    assert "the collector no longer moves: another person stopped it" in testbed.error
+
+
+def test_off_of_the_last_loop_stops_the_collector_and_the_sequence_goes_on(testbed):
+    right = {"loop": "right"}
+    testbed({"step": "standby", **right}, REFERENCE, SINE, {"step": "off", **right}, WAIT)
+    assert (testbed.outcomes(), testbed.error) == (["done"] * 5, "")
+    assert stands_still(testbed)
+
+
 def test_a_hexapod_that_is_not_referenced_fails_the_step(testbed):
     testbed(SINE)
     assert "reference it first" in testbed.error

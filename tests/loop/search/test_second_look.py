@@ -18,15 +18,15 @@ def star_at(az_px, el_px):
 
 
 def right(*moved_px, follow=True, lost=False):
-    return {"right": OtherStages(moved_px, follow, lost)}
+    return {"right": OtherStages(moved_px, follow, lost, np.array([28.0, 20.0]))}
 
 
 @pytest.fixture
 def attribution():
     """That of the left loop, which has a candidate at az 26 px and brings it to its target."""
     scale = scales(TWO_STARS, TWO_STARS.stellar_loops["left"])
-    attribution = Attribution(TWO_STARS, "left", StarEstimator(scale, np.array(TARGET_PX)))
-    place_px = attribution.propose(star_at(26.0, 20.0), right(0.0, 0.0))
+    attribution = Attribution(TWO_STARS.camera, StarEstimator(scale, np.array(TARGET_PX)))
+    place_px = attribution.propose(star_at(26.0, 20.0), np.array(TARGET_PX), right(0.0, 0.0))
     assert place_px.tolist() == [*TARGET_PX]
     return attribution
 
