@@ -13,7 +13,7 @@ from fitctl.controllers.centroid import OtherLight, Star, StarSensor, moving_wit
 from fitctl.controllers.estimator import StarEstimator
 from fitctl.logging.records import Severity
 from fitctl.loop.search.attribution import Attribution, nearest
-from fitctl.messages.modes import FOLLOWING, TRACKING, WITH_WINDOW, Mode
+from fitctl.messages.modes import TRACKING, WITH_WINDOW, Mode
 from fitctl.model.optics import AzEl, scales
 
 Floats = NDArray[np.float64]
@@ -128,15 +128,16 @@ class StarFinder:
     ) -> Star | None:
         """The loop's own star on a whole frame, on which other stars may be that look alike.
 
-        One that is followed is near where it is expected; one that was lost probably is.
+        One that is followed is near where it is expected; one that was lost probably is. So is one in an
+        experiment, which may be to find out where the stages move it.
         """
         stars = self._sensor.candidates(image)
         if self.attribution is not None:
             return self.attribution.choose(stars, mode, expected_px)
-        if mode in FOLLOWING:
+        if mode in WITH_WINDOW:
             near = (star for star in stars if is_within(*star[:2], *expected_px, FOLLOWED_PX))
             return nearest(near, expected_px)
-        if again and mode is Mode.ACQUISITION:
+        if again or mode is Mode.EXPERIMENT:
             return nearest(stars, expected_px)
         return next(stars, None)  # the brightest
 

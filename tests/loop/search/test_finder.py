@@ -5,7 +5,7 @@ import pytest
 
 from fitctl.config import AxisPair, Spot
 from fitctl.loop.search.finder import StarFinder
-from fitctl.messages.modes import FOLLOWING, Mode
+from fitctl.messages.modes import FOLLOWING, WITH_WINDOW, Mode
 from fitctl.model.image.scene import Scene
 
 STAR, BRIGHTER = (12.0, 15.0), (27.0, 22.0)  # px
@@ -54,9 +54,15 @@ def test_a_star_that_is_followed_is_the_nearest_to_where_it_is_expected(
 
 
 @pytest.mark.parametrize("follows", [True, False])
-@pytest.mark.parametrize("mode", sorted(FOLLOWING))
+@pytest.mark.parametrize("mode", sorted(WITH_WINDOW))
 def test_what_is_far_from_where_it_is_expected_is_another_star(finder, expose, mode, follows):
     assert found_px(finder, expose(BRIGHTER), mode, follows=follows) is None
+
+
+@pytest.mark.parametrize("follows", [True, False])
+def test_an_experiment_may_move_the_star_farther_than_the_rig_file_says(finder, expose, follows):
+    px = found_px(finder, expose(BRIGHTER), Mode.EXPERIMENT, follows=follows)
+    assert px == pytest.approx(BRIGHTER, abs=0.06)
 
 
 def test_a_first_search_finds_the_brightest(finder, expose):
