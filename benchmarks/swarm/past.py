@@ -356,11 +356,6 @@ DEFECTS = {
             (Loop, "_enter", _goes_on_in(Mode.SAFE)),
         ],
     ),
-    "follows-what-rests": Defect(
-        "09991ea",
-        "a loop drives its siderostat on after another loop's star, which it cannot move",
-        [(StellarLoop, "_find_unmoved", lambda _self, _star: None)],
-    ),
     "others-star": Defect(
         "883ec1c, bbf69a4",
         "a search accepts another loop's star that a jog or a link moves to where its own is expected",

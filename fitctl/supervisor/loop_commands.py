@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from fitctl.config import Rig
+from fitctl.controllers.attribution import FOLLOWED_PX, is_within
 from fitctl.loop.loop import Loop
 from fitctl.loop.metrology import MetrologyLoop
 from fitctl.loop.search.spiral import refused_area
@@ -38,8 +39,16 @@ def set_target(rig: Rig, loops: StellarLoops, command: SetTarget) -> str:
         return f"a target is of one loop; name the loop: {', '.join(loop.name for loop in loops)}"
     if not rig.camera.window_fits(command.az_px, command.el_px):
         return f"target {rig.camera.no_window_text(command.az_px, command.el_px)}"
-    for loop in loops:
-        loop.target_px = np.array([command.az_px, command.el_px])
+    (loop,) = loops
+    target_px = np.array([command.az_px, command.el_px])
+    for other in loop.others:
+        az_px, el_px = other.target_px.tolist()
+        if is_within(command.az_px, command.el_px, az_px, el_px, FOLLOWED_PX):
+            return (
+                f"target {command.az_px:g} {command.el_px:g}: loop {other.name} holds its star at {az_px:g} "
+                f"{el_px:g}; expected more than {FOLLOWED_PX:g} px between them along one axis"
+            )
+    loop.target_px = target_px
     return ""
 
 

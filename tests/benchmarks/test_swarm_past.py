@@ -14,7 +14,6 @@ from fitctl.messages.commands import (
     Recover,
     Release,
     SetBiasOffset,
-    SetTarget,
     Standby,
     Stop,
 )
@@ -117,23 +116,6 @@ FOUND = {
             Kill(at_s=28.0, back_after_s=0.1),
             duration_s=29.0,
             rig="fit-testbed.toml",
-        ),
-        "healed, every star is held within 60 s",
-    ),
-    "follows-what-rests": (
-        plan(
-            *[gives(at_s, None) for at_s in (3.2188, 7.986, 10.3929)],
-            # Where the star of the left loop is to rest.
-            gives(16.0128, SetTarget(loop="right", az_px=19.91032, el_px=17.558116)),
-            Strike(at_s=16.67734, device="left siderostat", fault="unplugged", lasts_s=0.08196),
-            Strike(at_s=26.1557, device="left piezo", fault="reset"),
-            gives(26.83926, SetTarget(loop="left", az_px=18.72842, el_px=18.990017)),
-            Strike(at_s=40.27059, device="left siderostat", fault="power cut"),
-            *[gives(at_s, None) for at_s in (50.2119, 50.6525)],
-            Strike(at_s=53.71987, device="left D/A", fault="reset"),
-            duration_s=150.0,
-            rig="two-stars.toml",
-            settings=slow_servos("two-stars.toml", 1),
         ),
         "healed, every star is held within 60 s",
     ),

@@ -7,7 +7,16 @@ from instruments.simulated import SlowExecutor, events_of, failing, mode_of, unt
 from fitctl.config import default_rig_path, load_rig
 from fitctl.drivers.interface import DeviceTimeout, DeviceUnreachable
 from fitctl.logging.records import CommandRecord, DeviceHealth, FrameRecord, PiezoReading, Tick
-from fitctl.messages.commands import Acquire, Off, Recover, Release, SetBiasOffset, Standby, Stop
+from fitctl.messages.commands import (
+    Acquire,
+    Off,
+    Recover,
+    Release,
+    SetBiasOffset,
+    SetTarget,
+    Standby,
+    Stop,
+)
 from fitctl.messages.modes import Mode
 from fitctl.simulation.devices import InlineExecutor
 from fitctl.simulation.simulation import Simulation
@@ -386,3 +395,17 @@ def test_what_the_service_leaves_after_the_end_is_recorded_once_it_has_ended(ver
     stops = [record for record in vernier.records if isinstance(record, CommandRecord)]
     assert stops[-1].sender == "anna"
     assert events_of(vernier)[-1].message == "anna: 100 messages"
+
+
+def test_two_stars_are_not_sent_to_one_place():
+    pair = Simulation(load_rig(default_rig_path().with_name("two-stars.toml")), 0)
+    right, left = (pair.supervisor.loops[name].target_px.tolist() for name in ("right", "left"))
+
+    refused = pair.command(SetTarget(loop="right", az_px=left[0] + 5.0, el_px=left[1] - 5.0))
+    accepted = pair.command(SetTarget(loop="right", az_px=left[0] + 5.0, el_px=left[1] - 7.0))
+
+    assert refused.text == (
+        "target 17 15: loop left holds its star at 12 20; expected more than 6 px between them along one axis"
+    )
+    assert accepted.accepted
+    assert pair.command(SetTarget(loop="right", az_px=right[0], el_px=right[1])).accepted

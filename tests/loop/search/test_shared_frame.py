@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from fitctl.config import default_rig_path, load_rig
+from fitctl.config import ARCSEC_PER_RAD, default_rig_path, load_rig
 from fitctl.messages.commands import Acquire, Jog, Release, SetTarget, Standby
 from fitctl.messages.modes import Mode
+from fitctl.model.optics import sky_px_per_rad
 from fitctl.simulation.simulation import Simulation
 from fitctl.simulation.statistics import true_residual_rms
 
@@ -142,8 +143,9 @@ def test_a_star_that_vanishes_is_lost_though_another_is_on_the_frame(held):
 def test_another_loops_star_that_rests_does_not_draw_the_siderostat_away(held):
     held.command(Release(loop=LEFT))
     held.run(1.0)
-    az_px, el_px = held.star_px(LEFT).tolist()
-    held.command(SetTarget(loop=RIGHT, az_px=az_px + 4.0, el_px=el_px))
+    away_px = np.array(TARGET_PX[RIGHT]) - [4.0, 0.0] - held.star_px(LEFT)
+    az_arcsec, el_arcsec = (away_px / sky_px_per_rad(held.rig) * ARCSEC_PER_RAD).tolist()
+    held.command(Jog(loop=LEFT, az_sky_arcsec=az_arcsec, el_sky_arcsec=el_arcsec))
     held.run(20.0)
     held.light(right=0.0, left=1.0)  # what is left beside its target is the other star
     begun_rad = held.loop(RIGHT).servo.position_rad
@@ -157,7 +159,7 @@ def test_another_loops_star_that_rests_does_not_draw_the_siderostat_away(held):
     assert farthest_px < 15.0
     assert "did not move with them" in " ".join(c.reason for c in held.mode_changes)
 
-    held.command(SetTarget(loop=RIGHT, az_px=28.0, el_px=20.0))
+    held.command(Jog(loop=LEFT, az_sky_arcsec=-az_arcsec, el_sky_arcsec=-el_arcsec))
     held.light(right=1.0, left=1.0)
     held.until(RIGHT, Mode.VERNIER)
     held.run(5.0)
