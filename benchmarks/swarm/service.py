@@ -314,13 +314,13 @@ class SwarmService(Service):
     ) -> None:
         tag = len(self._sent).to_bytes(8, "big")
         self._sent[tag] = _Sent(sender, command, self._time.now_s(), reply)
-        at_s = self._time.now_s() + self._delay_s(sender)
-        at_s = self._arrives_s[sender.name] = max(at_s, self._arrives_s.get(sender.name, 0.0))
         door = self._local if sender.is_local else self._gateway
         if not sender.is_local:
             payload = self._encode(
                 Passed(name=sender.name, role=sender.role, address=sender.address, payload=payload)
             )
+        at_s = self._time.now_s() + self._delay_s(sender)
+        at_s = self._arrives_s[sender.name] = max(at_s, self._arrives_s.get(sender.name, 0.0))
         router: Any = door.router
         self._time.call_at(at_s, partial(router.arrive, sender, tag, payload))
 
@@ -369,7 +369,7 @@ class SwarmService(Service):
         super()._answer_here(waiting, command, reply)
 
     def _in_time(self, waiting: Waiting, command: AnyCommand, reply: Reply) -> None:
-        """A command whose sender was told that nobody answers is not carried out after that; a stop is."""
+        """The supervisor carries out no command whose sender has given up, except a stop."""
         waited_s = self._time.now_s() - self._sent[waiting.tag].at_s
         most_s = REPLY_TIMEOUT_S + (0.0 if waiting.sender.is_local else _REMOTE_S[1])
         if reply.accepted and may_be_too_late(command) and waited_s > most_s:

@@ -198,7 +198,7 @@ def figure_11(rig: Rig, loop_name: str, seed: int, folder: Path, after_s: float)
         "commands, and the prefiltered target. The mirror truly is elsewhere by hysteresis, the siderostat "
         "by backlash. Star and mirror also show the air path, the siderostat hardly. "
         f"[A star that jumps by {FAR_STEP_PX:g} px in azimuth](fig11-far-step.svg) is beyond the mirror's "
-        "range: the loop goes back to COARSE and comes again."
+        "range: the loop searches for it and comes again."
     )
     return [Plate("fig11-step", "Fig. 11: a step of the commanded position", caption, rows)]
 

@@ -105,7 +105,7 @@ class StellarLoop(Loop):
         self._search_rests = False, False  # for an interlock; for another loop
         self._moved_s = journal.clock.now_s()
         self._search_due: bool | None = None  # whether it is for a star that was followed
-        self._asked_sky_rad = np.zeros(2)  # how far the sky had moved when the search was asked for
+        self._asked_sky_rad = np.zeros(2)  # how far the sky had moved at the command
         self._rig_noise_px = sensor_noise_px(rig.camera, self.settings, self.settings.star_flux_dn)
         self._recalled: StarPlace | None = None  # until the devices are open
         self._held_undone_rad = np.zeros(2)  # of link and sky, as an experiment began

@@ -129,7 +129,7 @@ COMMANDS = (
     CommandRow(commands.LearnerReport, "the Unix socket"),
 )
 MOST_WAIT_S = 1.75
-"""What has waited longer is not carried out: its sender gives up after ``REPLY_TIMEOUT_S``, and says so."""
+"""The supervisor carries out no command that is older: its sender gives up after ``REPLY_TIMEOUT_S``."""
 _MOST_SHOWN = 40  # characters of a word that is no command
 _LOGGED_OF_REFUSED = 100  # characters of its loop, of its values and of the answer
 ROWS = {row.make: row for row in COMMANDS}

@@ -79,7 +79,7 @@ def wait_for_end(client: Client, timeout_s: float) -> bool:
     Raises
     ------
     ConnectionError
-        If one elsewhere is silent in the end, and its machine does not say that nobody listens.
+        If one elsewhere sends no telemetry at the time limit, and its machine does not refuse a connection.
     """
     end_s = time.monotonic() + timeout_s
     folder, pid = client.folder, 0

@@ -68,14 +68,17 @@ _TICKS = {Tick, MetrologyTick}
 KINDS: set[Any] = _BEGIN | _BEFORE_TICK | _AT_THE_END | _TICKS | {FrameRecord}
 _MOTORS = ("siderostat_az_rad", "siderostat_el_rad")
 _STACKS = ("stack1_v", "stack2_v", "stack3_v")
+_MAY_BE_INFINITE = {"noise_az_arcsec", "noise_el_arcsec"}  # without light
 # By kind and field, what a number is less than.
 _MOST = {
-    kind: {name: MOST for name, field_type in get_type_hints(kind).items() if field_type is float}
+    kind: {
+        name: MOST
+        for name, field_type in get_type_hints(kind).items()
+        if field_type is float and name not in _MAY_BE_INFINITE
+    }
     for kind in KINDS
 }
 _MOST[LoopTiming]["servo_periods"] = _MOST_PERIODS
-for _name in ("noise_az_arcsec", "noise_el_arcsec"):  # infinite without light
-    del _MOST[MetrologyTick][_name]
 # The newest field that a replay needs of each kind of tick, and what a log without it lacks.
 _NEEDED = {
     Tick: ("fsm_written_s", "have neither commands nor when voltages took effect"),
@@ -164,7 +167,7 @@ def whole_run(paths: Sequence[Path]) -> Iterator[LogInfo]:
     ------
     LogError
         If a file cannot be read or is damaged, they are of several runs, what they hold does not begin
-        where the run did, or there is no room for the copy.
+        where the run did, or the temporary folder has no room for the copy.
     """
     runs = {log.path: log.metadata.get("clock", {}) for log in logs_of_one_run_each(paths)}
     first = runs[paths[0]]

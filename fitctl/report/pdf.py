@@ -48,7 +48,7 @@ def print_pdf(page: Path, pdf: Path, *, sandbox: bool = True) -> None:
         )
         raise PdfError(msg)
     _remove(pdf)
-    # What a browser that was ended has left is no reason for an error.
+    # The browser's children may still write while the folder is removed.
     with tempfile.TemporaryDirectory(prefix="fitctl-", ignore_cleanup_errors=True) as profile:
         arguments = [
             "--headless",

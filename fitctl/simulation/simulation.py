@@ -257,7 +257,7 @@ def simulate_rig(
             shown = time.perf_counter()
             on_progress(simulation.clock.now_s() / duration_s)
     speed_x = simulation.clock.now_s() / (time.perf_counter() - started)
-    loops = {name: _result_of(simulation, name, speed_x) for name in rig.loops}
+    loops = {name: of_enough(_result_of(simulation, name, speed_x)) for name in rig.loops}
     return RigResult(loops, _visibility(simulation), speed_x)
 
 
@@ -292,7 +292,7 @@ def _metrology_result(simulation: Simulation, name: str, speed_x: float) -> Metr
     start_s, end_s = _counted_from_s(simulation, name), simulation.clock.now_s()
     beam_m = part.history_offset_m(start_s, end_s)[:, 0] if start_s < end_s else np.empty((0, 2))
     beam_arcsec = beam_m / part.sensor.link_length_m * ARCSEC_PER_RAD
-    result = MetrologyResult(
+    return MetrologyResult(
         acquired_s=_reached_s(simulation, name, Mode.COARSE),
         locked_s=_reached_s(simulation, name, Mode.LOCKED),
         rms_arcsec=pair(rms(beam_arcsec)),
@@ -305,7 +305,6 @@ def _metrology_result(simulation: Simulation, name: str, speed_x: float) -> Metr
         samples=simulation.samples[name],
         speed_x=speed_x,
     )
-    return of_enough(result)
 
 
 def _visibility(simulation: Simulation) -> float:
@@ -335,7 +334,7 @@ def _result(simulation: Simulation, name: str, speed_x: float) -> SimulationResu
         simulation.plants[name], simulation.supervisor.stellar_loops[name].target_px, start_s, end_s
     )
     measured = np.array([[t.error_az_px, t.error_el_px] for t in judged]).reshape(-1, 2)
-    result = SimulationResult(
+    return SimulationResult(
         acquired_s=_reached_s(simulation, name, Mode.COARSE),
         vernier_s=_reached_s(simulation, name, Mode.VERNIER),
         rms_px=pair(true_px),
@@ -346,4 +345,3 @@ def _result(simulation: Simulation, name: str, speed_x: float) -> SimulationResu
         frames=sum(tick.number >= 0 for tick in ticks),
         speed_x=speed_x,
     )
-    return of_enough(result)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,10 +63,7 @@ class RigResult(NamedTuple):
     speed_x: float
 
 
-AnyResult = TypeVar("AnyResult", SimulationResult, MetrologyResult)
-
-
-def of_enough(result: AnyResult) -> AnyResult:
+def of_enough(result: SimulationResult | MetrologyResult) -> SimulationResult | MetrologyResult:
     """A loop's result, without an RMS if it held its star or its beam for less than `LEAST_S` once settled."""
     if result.judged_s >= LEAST_S:
         return result

@@ -36,11 +36,10 @@ StellarLoops = Sequence[StellarLoop]
 def set_target(rig: Rig, loops: StellarLoops, command: SetTarget) -> str:
     """Hold one loop's star elsewhere; empty, or why not."""
     if len(loops) != 1:  # two stars on one place are lost, and searched for and lost, without end
-        return f"a target is of one loop; name the loop: {', '.join(loop.name for loop in loops)}"
+        return f"a target is of one loop; name the loop: {_names(loops)}"
     if not rig.camera.window_fits(command.az_px, command.el_px):
         return f"target {rig.camera.no_window_text(command.az_px, command.el_px)}"
     (loop,) = loops
-    target_px = np.array([command.az_px, command.el_px])
     for other in loop.others:
         az_px, el_px = other.target_px.tolist()
         if is_within(command.az_px, command.el_px, az_px, el_px, FOLLOWED_PX):
@@ -48,14 +47,14 @@ def set_target(rig: Rig, loops: StellarLoops, command: SetTarget) -> str:
                 f"target {command.az_px:g} {command.el_px:g}: loop {other.name} holds its star at {az_px:g} "
                 f"{el_px:g}; expected more than {FOLLOWED_PX:g} px between them along one axis"
             )
-    loop.target_px = target_px
+    loop.target_px = np.array([command.az_px, command.el_px])
     return ""
 
 
 def look(rig: Rig, loops: StellarLoops, command: Look) -> str:
     """Measure one loop's star elsewhere on the next frame; empty, or why not."""
     if len(loops) != 1:
-        return f"one loop looks at a place; name the loop: {', '.join(loop.name for loop in loops)}"
+        return f"one loop looks at a place; name the loop: {_names(loops)}"
     (loop,) = loops
     if loop.mode not in WITH_WINDOW:
         return f"look is not available in {loop.mode.name}; it needs COARSE or VERNIER"
@@ -74,7 +73,7 @@ def reset_interlock(_rig: Rig, loops: Loops, command: Reset) -> str:
 def start_experiment(rig: Rig, loops: StellarLoops, command: Experiment) -> str:
     """Make an experiment's motions with one loop's stages; return why not, or an empty text."""
     if len(loops) != 1:
-        return f"an experiment is on one loop; name it: {', '.join(loop.name for loop in loops)}"
+        return f"an experiment is on one loop; name it: {_names(loops)}"
     (loop,) = loops
     if transition(loop.mode, Trigger.EXPERIMENT) is None:
         return f"experiment is not available in {loop.mode.name}; it needs COARSE or VERNIER"
@@ -95,11 +94,9 @@ def start_experiment(rig: Rig, loops: StellarLoops, command: Experiment) -> str:
 
 def why_no_search(rig: Rig, loops: Loops, command: Acquire) -> str:
     """Why a search cannot be as it is asked for; empty if it can."""
-    if len(loops) > 1 and (command.expected_az_sky_arcsec, command.expected_el_sky_arcsec) != (
-        None,
-        None,
-    ):
-        return f"acquire: a place is of one loop; name the loop: {', '.join(loop.name for loop in loops)}"
+    place = {command.expected_az_sky_arcsec, command.expected_el_sky_arcsec} - {None}
+    if place and len(loops) > 1:
+        return f"acquire: a place is of one loop; name the loop: {_names(loops)}"
     refused = (
         refused_area(loop.settings, loop.name, command)
         if isinstance(loop, MetrologyLoop)
@@ -136,3 +133,7 @@ def obey_loop_command(rig: Rig, loops: Loops, command: AnyCommand) -> str:
             f"{row.word or row.name} is for a stellar loop; {command.loop} holds a metrology beam"
         )
     return OF_STARS[type(command)](rig, stellar, command)
+
+
+def _names(loops: Loops) -> str:
+    return ", ".join(loop.name for loop in loops)

@@ -1,4 +1,4 @@
-"""When a supervisor that was told to end has ended: here, and on another machine."""
+"""When a supervisor has ended after `shutdown`: on this machine, and on another."""
 
 import socket
 from types import SimpleNamespace

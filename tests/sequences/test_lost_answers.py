@@ -1,6 +1,7 @@
 """Commands that are not answered, and reports that are refused: what the sequence still stops."""
 
 import pytest
+from sequence_runs import REFERENCE, SINE, WAIT, lose
 
 from fitctl.messages.commands import (
     MoveCollector,
@@ -11,33 +12,8 @@ from fitctl.messages.commands import (
     SequenceStatus,
 )
 
-REFERENCE = {"step": "collector", "action": "reference"}
-SINE = {
-    "step": "collector",
-    "action": "start",
-    "kind": "sine",
-    "amplitude_mm": 2.0,
-    "frequency_hz": 0.2,
-}
-WAIT = {"step": "wait", "duration_s": 3.0}
 NOWHERE = "plant.loops.right.star_offset_sky_arcsec_max=5000.0"
 TOO_MANY = Reply(accepted=False, text="more than 50 commands a second; wait, then try again")
-
-
-def lose(link, is_lost, *, obeyed=False):
-    """The next command that `is_lost` picks is not answered; whether it is obeyed all the same."""
-    send, lost = link.send, []
-
-    def sends(command):
-        if lost or not is_lost(command):
-            return send(command)
-        lost.append(command)
-        if obeyed:
-            send(command)
-        msg = "no answer within 2 s"
-        raise ConnectionError(msg)
-
-    link.send = sends
 
 
 def refuse_reports(link, from_s, to_s):

@@ -278,9 +278,11 @@ class Batch:
         if run.ended != DONE:
             return simulate_rig(self._rig, seed, duration_s)
         loops = {
-            name: self._metrology_result(name, loop.state)
-            if name in self._beams
-            else _stellar_result(loop.state)
+            name: of_enough(
+                self._metrology_result(name, loop.state)
+                if name in self._beams
+                else _stellar_result(loop.state)
+            )
             for name, loop in run.loops.items()
         }
         visibility, fringes = math.nan, self._rig.fringes
@@ -294,7 +296,7 @@ class Batch:
         length_m = truth.metrology_loops[name].sensor.link_length_m
         rms_m = np.sqrt(_mean(state["true_sum2"], state["residual_steps"]))
         judged_s = float(state["now_s"] - state["residual_from_s"])
-        result = MetrologyResult(
+        return MetrologyResult(
             acquired_s=float(state["acquired_s"]),
             locked_s=float(state["held_s"]),
             rms_arcsec=pair(rms_m / length_m * ARCSEC_PER_RAD),
@@ -303,7 +305,6 @@ class Batch:
             samples=int(state["samples"]),
             speed_x=math.nan,
         )
-        return of_enough(result)
 
 
 def _begin(r: np.void) -> None:
@@ -317,7 +318,7 @@ def _stellar_result(state: np.void) -> SimulationResult:
     piston_m = _mean(state["piston_sum_m"], steps)
     piston_m2 = _mean(state["piston_sum_m2"], steps) - piston_m**2
     judged_s = float(state["now_s"] - state["residual_from_s"])
-    result = SimulationResult(
+    return SimulationResult(
         acquired_s=float(state["acquired_s"]),
         vernier_s=float(state["held_s"]),
         rms_px=pair(np.sqrt(_mean(state["true_sum2"], steps))),
@@ -328,7 +329,6 @@ def _stellar_result(state: np.void) -> SimulationResult:
         frames=int(state["frames"]),
         speed_x=math.nan,
     )
-    return of_enough(result)
 
 
 def _mean(total: Floats, count: int) -> Floats:

@@ -1,6 +1,7 @@
 """`acquire` without a loop: all loops search at once, and only one that finds nothing searches again."""
 
 import pytest
+from sequence_runs import lose
 
 from fitctl.messages.commands import Acquire
 
@@ -46,17 +47,7 @@ def test_only_the_loop_that_found_nothing_searches_again(run):
 
 
 def test_a_lost_answer_ends_the_searches_of_all_loops_at_once(run):
-    def lose_the_next(link):
-        send = link.send
-
-        def sends(command):
-            link.send = send
-            msg = "no answer within 2 s"
-            raise ConnectionError(msg)
-
-        link.send = sends
-
-    run.link.meddling = [(1.0, lose_the_next)]
+    run.link.meddling = [(1.0, lambda link: lose(link, lambda _: True))]
 
     with pytest.raises(ConnectionError):
         run({"step": "standby"}, {**NO_STAR, "attempts": 2})

@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from sequence_runs import REFERENCE, lose
 
 from fitctl.cli import main
 from fitctl.config import default_rig_path, load_rig
@@ -30,7 +31,6 @@ NEAR = (
     "plant.loops.left.star_offset_sky_arcsec_max=20.0",
     "plant.loops.metrology.beam_offset_sky_arcsec_max=20.0",
 )
-REFERENCE = {"step": "collector", "action": "reference"}
 SCAN = {"step": "collector_scan", "loop": "left", "cycles": 3}
 WALL_S = 1_795_000_000.0
 
@@ -129,15 +129,8 @@ def test_a_scan_names_the_loop_whose_safe_stopped_the_collector(testbed):
 
 def test_a_scan_whose_answer_is_lost_leaves_no_collector_moving(testbed):
     def lose_the_next(link):
-        send = link.send
-
-        def sends(_command):
-            link.send = send
-            msg = "no answer within 2 s"
-            raise ConnectionError(msg)
-
         assert link.receive(1.0).collector.motion
-        link.send = sends
+        lose(link, lambda _: True)
 
     run = testbed()
     run.link.meddling = [(30.0, lose_the_next)]

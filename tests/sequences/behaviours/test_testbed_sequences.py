@@ -1,6 +1,7 @@
 """Sequences on the whole testbed: a collector that moves, a metrology loop, and the fringes of two stars."""
 
 import pytest
+from sequence_runs import REFERENCE, SINE, WAIT
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.messages.commands import MoveCollector, SequenceControl, Stop
@@ -11,15 +12,6 @@ from fitctl.sequences.reading import STEPS, make_step
 pytestmark = pytest.mark.long
 
 RIG = load_rig(default_rig_path().parent / "fit-testbed.toml")
-REFERENCE = {"step": "collector", "action": "reference"}
-SINE = {
-    "step": "collector",
-    "action": "start",
-    "kind": "sine",
-    "amplitude_mm": 2.0,
-    "frequency_hz": 0.2,
-}
-WAIT = {"step": "wait", "duration_s": 3.0}
 
 
 @pytest.fixture
