@@ -38,7 +38,7 @@ from benchmarks.swarm.invariants import ANSWERED_ONCE, Invariants
 from benchmarks.swarm.lines import Bus, Line
 from benchmarks.swarm.own_stars import turned_by
 from benchmarks.swarm.recorder import SwarmRecorder
-from benchmarks.swarm.service import SENDERS, SwarmService
+from benchmarks.swarm.service import HELD_BACK_S, SENDERS, SwarmService
 from benchmarks.swarm.telemetry_wire import Publisher, RemoteConsole, Subscriber
 from benchmarks.swarm.threads import VirtualExecutor, VirtualTime
 from fitctl.config import Rig, load_rig
@@ -381,7 +381,8 @@ class Instrument:
                     self.found_s.pop(name, None)  # the star is expected elsewhere from now on
         self._posted += 1
         number = self._posted
-        since = self.time.now_s(), self.time.awake_s(), type(command).__name__
+        network_s = 0.0 if SENDERS[who].is_local else 2 * HELD_BACK_S[1]
+        since = self.time.now_s(), self.time.awake_s() + network_s, type(command).__name__
         self._unanswered[number] = since
         answered = partial(self._answered, self._lives, number, command)
         service.send(SENDERS[who], command, answered)

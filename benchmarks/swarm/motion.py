@@ -15,13 +15,16 @@ from fitctl.clock import Clock
 from fitctl.config import Rig
 from fitctl.drivers.interface import AzEl, Pose
 from fitctl.loop.loop import Loop
-from fitctl.messages.modes import AT_REST, Mode
+from fitctl.loop.stellar import StellarLoop
+from fitctl.messages.modes import AT_REST, POINTING, Mode
 from fitctl.model.plant import Plant
 from fitctl.supervisor.supervisor import Supervisor
 
 Floats = NDArray[np.float64]
 _HARDLY = 0.02  # of the velocity limit: slower, a servo corrects what its encoder counts
 _MOVED_S = 1.0  # beyond the time that a siderostat takes from one end of its travel to the other
+# Beyond the time that it takes to slow down; and in times of the servo's own, until that has settled.
+_STANDS_S, _SETTLED = 0.2, 10.0
 _MIRROR_RESTS_S = 1.0  # beyond the time that a mirror takes through its whole range
 WELL_S = 2.0  # after a fault, a line is taken to be well
 _DECIDED_S = 0.001  # no later than this after its decision a write is sent, on a line that is well
@@ -93,7 +96,8 @@ class Motion:
         self._three_periods_s = {
             name: 3 / loop.siderostat.servo.rate_hz for name, loop in rig.loops.items()
         }
-        self._travel_rad, self._farthest_rad, self._moved_s = {}, {}, {}
+        self._travel_rad, self._farthest_rad, self._moved_s, self._slowed_s = {}, {}, {}, {}
+        self._held_s: dict[str, float] = {}  # by loop: since when it is held
         self._turned_rad: dict[str, list[float]] = {}  # by loop: beyond its travel, how far it was
         for name, loop in rig.loops.items():
             siderostat = loop.siderostat
@@ -104,6 +108,8 @@ class Motion:
             self._turned_rad[name] = [self._farthest_rad[name]] * 2
             crossing_s = 2 * travel_rad / siderostat.velocity_limit_rad_s
             self._moved_s[name] = crossing_s + _MOVED_S
+            slows_s = siderostat.velocity_limit_rad_s / siderostat.acceleration_limit_rad_s2
+            self._slowed_s[name] = slows_s + _STANDS_S + _SETTLED / siderostat.servo.gain_per_s
         self._velocity_step_rad_s = {
             name: loop.siderostat.acceleration_limit_rad_s2 / loop.siderostat.servo.rate_hz * _SLACK
             for name, loop in rig.loops.items()
@@ -116,6 +122,7 @@ class Motion:
         self.jogged_s.clear()
         self._slowly.clear()
         self._standing_rad.clear()
+        self._held_s.clear()
 
     def velocity(self, name: str, velocity_rad_s: AzEl) -> None:
         """A velocity is sent to a loop's motors."""
@@ -179,18 +186,22 @@ class Motion:
                 )
 
     def stands(self, name: str, loop: Loop, now_s: float) -> None:
-        """In STANDBY a siderostat moves only where a jog has sent it, or back to where it was held."""
+        """A siderostat stands still in STANDBY, apart from jogs, and while its loop is held.
+
+        In STANDBY it may go back to where it was held.
+        """
+        is_held = _is_held(loop)
+        if not is_held:
+            self._held_s.pop(name, None)
+            if loop.mode is not Mode.STANDBY:
+                self._standing_rad.pop(name, None)
+                return
         line = self._lines[f"{name} siderostat"]
-        moves_s = max(
-            loop.mode_since_s, self.jogged_s.get(name, 0.0), line.healed_s, self.stall_ended_s
-        )
-        stands = (
-            loop.mode is Mode.STANDBY
-            and now_s - moves_s > self._moved_s[name]
-            and not line.is_bad
-            and not line.wrong  # motors that do not move are commanded on, until the servo notices
-        )
-        if not stands:
+        since_s = self._held_s.setdefault(name, now_s) if is_held else self.jogged_s.get(name, 0.0)
+        moves_s = max(since_s, loop.mode_since_s, line.healed_s, self.stall_ended_s)
+        most_s = (self._slowed_s if is_held else self._moved_s)[name]
+        # Motors that do not move are commanded on, until the servo notices.
+        if now_s - moves_s <= most_s or line.is_bad or line.wrong:
             self._standing_rad.pop(name, None)
             return
         motor_rad = self._plant.loops[name].state.motor_rad[0].tolist()
@@ -199,8 +210,8 @@ class Motion:
         count_rad = math.tau / self._rig.loops[name].siderostat.encoder_counts_per_rev
         if moved_rad > _MOST_COUNTS * count_rad:
             self._violated(
-                "a siderostat that nobody moves stands still in STANDBY",
-                f"{name}: {moved_rad:.4f} rad, {now_s - moves_s:.3f} s after it was moved",
+                f"a siderostat {'whose loop is held' if is_held else 'that nobody moves'} stands still",
+                f"{name}: {moved_rad:.4f} rad in {loop.mode.name}, {now_s - moves_s:.3f} s after it was moved",
             )
 
     def pose(self, pose: Pose, velocity_mm_s: float) -> None:
@@ -290,3 +301,13 @@ class Motion:
     def mirror_moved(self, name: str) -> None:
         """A loop's D/A has gone to its safe voltages by itself, or somebody commands another bias."""
         self._mirror_moved_s[name] = self._clock.now_s()
+
+
+def _is_held(loop: Loop) -> bool:
+    """An interlock, or a search's wait for another loop, keeps the stages of a loop where they are."""
+    if loop.mode not in POINTING or loop.interlocks.holds:
+        return loop.mode in POINTING
+    if loop.mode is not Mode.ACQUISITION or not isinstance(loop, StellarLoop) or not loop._waits:
+        return False
+    link = loop.star_motion.link
+    return link is None or not link.holds

@@ -384,6 +384,14 @@ DEFECTS = {
         "a sequence goes on though a loop of one of its steps is SAFE, if another has the present step",
         [(Contact, "_obey", _obey_for_the_present_loop)],
     ),
+    "slews-while-held": Defect(
+        "fb3099c6",
+        "a siderostat that a search or a return sent far away slews on while an interlock holds its loop",
+        [
+            (StellarLoop, "_rest_search", lambda *_, **__: None),
+            (StellarLoop, "_rest_return", lambda *_, **__: None),
+        ],
+    ),
     "jog-in-off": Defect(
         "ac43419",
         "a jog goes on in OFF until the amplifiers have lost their power",

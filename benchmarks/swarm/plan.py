@@ -85,7 +85,8 @@ _OF_TESTBED = (
 # Fraction of commands that are repeated, drawn for each run, and the mean delay: a key held down.
 _REPEATED, _REPEATED_S = (0.0, 0.1, 0.6), 0.02
 _PLACES, _FEW_PLACES = 3, 0.5  # fraction of runs whose targets are only so many places
-_SLOW_SLEW = 0.4  # fraction of interrupted slews on a slow line,
+_LATE_FRAMES = 0.2  # fraction of interrupted slews that late frames meet
+_SLOW_SLEW = 0.4  # of the others, fraction on a slow line,
 _BRIEFLY = 0.5  # and of these, fraction of lines that are slow for a moment
 _KILLED_SEARCHES = 0.1  # fraction of runs with searches in which the supervisor is killed
 _HELD_S, _HIDDEN_S = (10.0, 40.0), (30.0, 80.0)  # when clouds come then, and how long they last
@@ -306,9 +307,20 @@ def _drawn_size(random: Random, device: str, fault: str) -> float:
 
 
 def _interrupted_slew(random: Random, at_s: float, loops: tuple[str, ...]) -> list[Happening]:
-    """A loop lets its star go and searches far away; its amplifiers fail, or the computer stalls, meanwhile."""
+    """A loop lets its star go and searches far away.
+
+    Meanwhile its amplifiers fail, the computer stalls, or frames come late, which may hold the stages.
+    """
     loop, who = random.choice(loops), OPERATORS[0]
     far = msgspec.structs.replace(far_search(random), loop=loop)
+    sent = [
+        Order(at_s=at_s, who=who, command=Release(loop=loop)),
+        Order(at_s=at_s + 0.1, who=who, command=far),
+    ]
+    if random.random() < _LATE_FRAMES:
+        size, lasts_s = random.uniform(20.0, 60.0), random.uniform(0.5, 4.0)
+        late = Strike(at_s=at_s, device="camera", fault="slow", size=size, lasts_s=lasts_s)
+        return [*sent, late]
     fault = "slow" if random.random() < _SLOW_SLEW else random.choice(FAULTS)
     struck_s = at_s + 0.1 + random.uniform(0.0, _SLEW_S)
     failing = _strike(random, struck_s, [f"{loop} siderostat"], [fault])
@@ -316,12 +328,7 @@ def _interrupted_slew(random: Random, at_s: float, loops: tuple[str, ...]) -> li
     if fault == "slow" and random.random() < _BRIEFLY:  # readings come late while motors turn on
         failing = [msgspec.structs.replace(failing[0], lasts_s=random.uniform(0.05, 0.5))]
         stall = [Stall(at_s=struck_s, lasts_s=random.uniform(0.02, 0.2))]
-    return [
-        Order(at_s=at_s, who=who, command=Release(loop=loop)),
-        Order(at_s=at_s + 0.1, who=who, command=far),
-        *failing,
-        *random.choice(([], stall)),
-    ]
+    return [*sent, *failing, *random.choice(([], stall))]
 
 
 def _killed_search(random: Random, at_s: float) -> list[Happening]:

@@ -22,6 +22,8 @@ SETTINGS = (
 )
 """Settings that some runs change."""
 _SETTING = 0.15  # fraction of runs that change each of them
+_HELD_SEARCH = 'interlocks.frame_age.modes=["ACQUISITION", "COARSE", "VERNIER"]'
+_HELD_SEARCHES = 0.5  # fraction of runs in which late frames hold a search too
 _SLOW_SERVO = {
     "servo.rate_hz": (100.0, 50.0),
     "servo.gain_per_s": (40.0, 15.0),
@@ -177,6 +179,7 @@ def drawn_settings(random: Random, rig: str, duration_s: float, *, fast: bool) -
     # At the rig's own rate, telemetry takes a tenth of the run's time.
     settings = ["supervisor.telemetry_hz=5.0"]
     settings += [text for text in SETTINGS if random.random() < _SETTING]
+    settings += [_HELD_SEARCH] * (random.random() < _HELD_SEARCHES)
     if fast:
         settings += _FAST_FRAMES
     elif random.random() < SLOW.get(rig, 0.0):

@@ -64,6 +64,9 @@ _ROUND_S = 0.005
 _ENDS_S = 5.0
 _LOCAL_S = (1e-5, 1e-3)
 _REMOTE_S = (1e-3, 0.3)
+_HELD_BACK = 0.02  # of the messages from and to elsewhere
+HELD_BACK_S = (0.3, 2.5)
+"""For so long the network holds these."""
 _GARBAGE = 0.02  # of the messages
 _MOST_GARBAGE_BYTES = 200
 # So many refusals within that time may be followed by some without an answer.
@@ -325,7 +328,10 @@ class SwarmService(Service):
         self._time.call_at(at_s, partial(router.arrive, sender, tag, payload))
 
     def _delay_s(self, sender: Sender) -> float:
-        return self._random.uniform(*(_LOCAL_S if sender.is_local else _REMOTE_S))
+        if sender.is_local:
+            return self._random.uniform(*_LOCAL_S)
+        is_held_back = self._random.random() < _HELD_BACK
+        return self._random.uniform(*(HELD_BACK_S if is_held_back else _REMOTE_S))
 
     def _take_answer(self, tag: bytes, payload: bytes) -> None:
         sent = self._sent[tag]

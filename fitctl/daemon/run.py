@@ -304,8 +304,10 @@ def _loop(
         while clock.now_s() < end_s and not supervisor.at_rest():
             supervisor.step()
     finally:
-        supervisor.close()
-        watcher.shutdown(cancel_futures=True)
+        try:
+            supervisor.close()
+        finally:
+            watcher.shutdown(cancel_futures=True)
 
 
 def _keeps_bound(

@@ -103,6 +103,7 @@ class StellarLoop(Loop):
         self._tick_records = TickRecords(rig, name)
         self._flattened = self._held = False
         self._search_rests = False, False  # for an interlock; for another loop
+        self._return_rad: Floats | None = None  # whereto an interlock has stopped the siderostat
         self._moved_s = journal.clock.now_s()
         self._search_due: bool | None = None  # whether it is for a star that was followed
         self._asked_sky_rad = np.zeros(2)  # how far the sky had moved at the command
@@ -231,6 +232,7 @@ class StellarLoop(Loop):
     def _move(self, observation: Observation) -> None:
         """Follow the link and the mode's law, unless an interlock holds or flattens."""
         stopped = self._is_stopped
+        self._rest_return(observation, stopped=stopped)
         if not stopped:
             self.star_motion.undo(
                 self.siderostat,
@@ -267,6 +269,17 @@ class StellarLoop(Loop):
             self.search.delay(passed_s)
             if self._search_rests != before:
                 self.siderostat.hold(newest_rad(observation.servo))
+
+    def _rest_return(self, observation: Observation, *, stopped: bool) -> None:
+        """A siderostat on its way back to its star stops for an interlock, and goes on after it."""
+        follows = self.mode in FOLLOWING
+        if self._return_rad is not None and not (stopped and follows):
+            if follows:
+                self.siderostat.undo_to(self._return_rad)
+            self._return_rad = None
+        elif self._return_rad is None and stopped and follows and self.waits_for:
+            self._return_rad = self.siderostat.wanted_rad
+            self.siderostat.hold(newest_rad(observation.servo))
 
     def _follow_plays(self, observation: Observation) -> None:
         """The mirror makes up for backlash in VERNIER only, and then from where the plays are."""
@@ -483,8 +496,10 @@ class StellarLoop(Loop):
                 loop = link.loop
                 return f"the link of {loop.name}, which is in {loop.mode.name}"
             # After a link's return the siderostat may have far to go.
-            setpoint_rad = self.siderostat.setpoint_rad
-            if self.waits_for and not self.search.is_near(motor_rad, setpoint_rad):
+            goal_rad = (
+                self.siderostat.setpoint_rad if self._return_rad is None else self._return_rad
+            )
+            if self.waits_for and not self.search.is_near(motor_rad, goal_rad):
                 return "its siderostat, which is on its way to the star"
         if self.mode is Mode.ACQUISITION and self._search_due is not None:
             # Two stars look alike: only the own one moves while the other loop's stages stand still.

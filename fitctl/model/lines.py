@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fitctl.config import Line
 from fitctl.model.compiled import compilable
-from fitctl.model.image.pixel_noise import pixel_normals
+from fitctl.model.image.pixel_noise import normals_of_frames, pixel_normals
 
 Floats = NDArray[np.float64]
 LEAST_HZ = 0.01
@@ -55,7 +55,7 @@ def line_states(table: Floats, key: int) -> Floats:
 
 def line_kicks(key: int, first_node: int, nodes: int, lines: int) -> Floats:
     """Standard normals that kick lines at the end of each node, shape (nodes, lines)."""
-    return np.array([pixel_normals(key, first_node + node + 1, lines) for node in range(nodes)])
+    return normals_of_frames(key, first_node + 1, nodes, lines)
 
 
 @compilable()

@@ -70,7 +70,7 @@ class CollectorWatch:
         self._busy = False
         self._stops = 0
         self._stopping = 0
-        self._stopping_lock = threading.Lock()
+        self._lock = threading.Lock()  # a stop may come from two threads at once
         self._fault: Exception | None = None
         self._threads: list[threading.Thread] = []
 
@@ -109,10 +109,11 @@ class CollectorWatch:
 
     def stop(self) -> None:
         """Stop the hexapod where it is, at once; from any thread. A start that is under way ends too."""
-        self._stops += 1
-        if self.is_open:
-            with self._stopping_lock:
-                self._stopping += 1
+        with self._lock:
+            self._stops += 1
+            connected = self.is_open
+            self._stopping += connected
+        if connected:
             self._beside(self._stop_at_once)
 
     def check(self) -> None:
@@ -185,7 +186,7 @@ class CollectorWatch:
         try:
             self._stop()
         finally:
-            with self._stopping_lock:
+            with self._lock:
                 self._stopping -= 1
 
     def _stop(self) -> None:
@@ -210,7 +211,8 @@ class CollectorWatch:
         """In a thread of its own, unless nothing is threaded: a simulation, whose clock would go on."""
         if self.drive.threaded:
             thread = threading.Thread(target=work, name="collector", daemon=True)
-            self._threads = [one for one in self._threads if one.is_alive()] + [thread]
-            thread.start()
+            with self._lock:
+                self._threads = [one for one in self._threads if one.is_alive()] + [thread]
+                thread.start()
         else:
             work()

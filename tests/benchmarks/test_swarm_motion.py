@@ -84,7 +84,8 @@ def test_a_drive_that_watches_nobody_turns_on_while_it_cannot_be_reached():
     assert watched.go_on(10.0) == []
 
 
-MOVES = ["a siderostat that nobody moves stands still in STANDBY"]
+MOVES = ["a siderostat that nobody moves stands still"]
+SLEWS = ["a siderostat whose loop is held stands still"]
 
 
 def turn(watched, turned_rad=0.01):
@@ -131,6 +132,29 @@ def test_motors_that_are_stuck_are_commanded_in_standby():
     turn(watched)
 
     assert watched.go_on(0.1) == []
+
+
+def test_a_siderostat_slows_down_and_stands_still_while_an_interlock_holds_its_loop():
+    watched = Rig(mode=Mode.ACQUISITION)
+    turn(watched)
+    assert watched.go_on(5.0) == []
+
+    interlocks = watched.loops["right"].interlocks
+    interlocks.holds = True
+    turn(watched)  # as it slows down
+    assert watched.go_on(3.0) == []
+
+    turn(watched)
+    assert watched.go_on(0.1) == SLEWS
+
+
+def test_a_siderostat_that_was_held_may_move_as_soon_as_it_is_held_no_more():
+    watched = Rig(mode=Mode.COARSE)
+    interlocks = watched.loops["right"].interlocks
+    for holds in (True, False, True):
+        interlocks.holds = holds
+        turn(watched)
+        assert watched.go_on(1.0) == []
 
 
 @pytest.mark.parametrize(

@@ -59,6 +59,15 @@ FOUND = {
         ),
         "an axis that is not stuck is not called so",
     ),
+    "slews-while-held": (
+        plan(
+            gives(0.1, Standby()),
+            gives(2.0, FAR),
+            Strike(at_s=1.5, device="camera", fault="slow", size=25.0, lasts_s=5.0),
+            settings=['interlocks.frame_age.modes=["ACQUISITION"]'],
+        ),
+        "a siderostat whose loop is held stands still",
+    ),
     "star-forgotten": (
         plan(
             gives(0.1, Standby()),

@@ -57,6 +57,7 @@ class Rig:
                 mode_since_s=0.0,
                 servo=self.servo,
                 mirror=SimpleNamespace(command_rad=np.zeros(2)),
+                interlocks=SimpleNamespace(holds=False),
             )
             for name in self.rig.loops
         }

@@ -12,6 +12,7 @@ from fitctl.messages.commands import (
     Off,
     Recover,
     Release,
+    Reset,
     SetController,
     SetTarget,
     Standby,
@@ -255,6 +256,43 @@ def test_after_the_links_return_left_waits_until_its_own_siderostat_is_back_too(
     assert left.waits_for == ""
     assert held.modes()[LEFT] is Mode.VERNIER
     assert "no longer waits for its siderostat" in str(held.events(LEFT)[-3:])
+    since_s = held.clock.now_s() + 2.0
+    held.run(7.0)
+    assert held.rms_px(LEFT, since_s).max() < 0.05
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("action", ["freeze", "flatten"])
+def test_a_siderostat_on_its_way_back_to_its_star_stops_for_an_interlock_and_goes_on(action):
+    row = (
+        "{quantity='siderostat_travel_fraction', high=1.0, for_s=0.0, modes=['VERNIER'], "
+        f"action='{action}', reset='hand'}}"
+    )
+    held = Testbed(f"interlocks.far={row}").held()
+    held.laser(0.0)
+    held.until(limit_s=1.0, metrology=Mode.ACQUISITION)
+    left = held.loop(LEFT)
+    left.siderostat.move_by(np.array([70.0, 0.0]))
+    held.run(3.0)
+    held.laser(1.0)
+    held.until(limit_s=10.0, metrology=Mode.LOCKED)
+    left.siderostat.move_by(np.array([-70.0, 0.0]))
+    held.run(1.0)
+
+    rule = left.interlocks._rules["far"]
+    rule.high = 0.001
+    held.run(0.5)
+    assert left.tick_record().held
+    stopped_rad = left.servo.position_rad
+    held.run(5.0)
+    assert left.servo.position_rad == pytest.approx(stopped_rad, abs=0.5)
+    assert left.waits_for == "its siderostat, which is on its way to the star"
+    rule.high = 1.0
+    assert held.command(Reset(loop=LEFT, name="far")).accepted
+
+    held.run(4.0)
+    assert left.mode is Mode.VERNIER
+    assert left.waits_for == ""
     since_s = held.clock.now_s() + 2.0
     held.run(7.0)
     assert held.rms_px(LEFT, since_s).max() < 0.05

@@ -169,6 +169,34 @@ def test_it_is_not_moved_before_it_is_referenced(watched):
     assert watch.is_open, "a refusal does not end the connection"
 
 
+class Meanwhile:
+    """Stands for a thread of the watch: while that looks whether it is alive, another stop comes."""
+
+    def __init__(self, stop):
+        self.other = threading.Thread(target=stop)
+        self.asked = False
+
+    def is_alive(self):
+        if not self.asked:
+            self.asked = True
+            self.other.start()
+            self.other.join(0.2)
+        return True
+
+
+def test_of_two_stops_at_once_neither_is_forgotten(watched):
+    watch, mock = watched
+    moving(watch, mock)
+    meanwhile = Meanwhile(watch.stop)
+    watch._threads = [meanwhile]
+    watch.stop()
+    meanwhile.other.join(PATIENCE_S)
+
+    assert len(watch._threads) == 3  # close waits for these
+    watch._threads.remove(meanwhile)
+    until(lambda: not watch.state.busy, "the end of both stops")
+
+
 def test_a_stop_returns_without_waiting_for_the_hexapod(watched):
     watch, mock = watched
     moving(watch, mock)

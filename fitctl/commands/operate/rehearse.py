@@ -13,6 +13,7 @@ from fitctl.commands.shared.present import present_of_rig
 from fitctl.commands.shared.printing import say, to_json
 from fitctl.commands.shared.rig import rig_of
 from fitctl.commands.shared.supervisor import address, show_rig
+from fitctl.config import ConfigError
 from fitctl.messages.command_table import command_of
 from fitctl.processes import ended_by_signals, interrupt
 
@@ -59,6 +60,9 @@ def rehearse(
     if remote is None:
         found = address("rehearse", rig, overrides)
         rig, overrides = found.file, found.settings
+    elif rig is None:
+        msg = "rehearse: with --remote, name the rig file of that instrument with --rig; it is simulated here"
+        raise ConfigError(msg)
     settings = rig_of(rig, overrides)
     settings.mock_parts()
     show_rig(settings.name, str(rig or remote))

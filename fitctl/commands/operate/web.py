@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import secrets
 import shlex
+import socket
 import sys
 from collections.abc import Awaitable, Callable, Sequence
 
@@ -63,9 +65,13 @@ def serve_console(rig_arguments: Sequence[str], port: int) -> None:
 
     command = shlex.join([sys.executable, "-m", "fitctl", "console", *rig_arguments])
     try:
+        socket.create_server(
+            (HOST, port)
+        ).close()  # an address is printed before the server has its port
         GuardedServer(command, host=HOST, port=port, title="fitctl").serve()
     except OSError as error:
-        msg = f"console --web: port {port}: {error.strerror}; choose another with --port"
+        why = os.strerror(error.errno or 0)
+        msg = f"console --web: port {port}: {why}; choose another with --port"
         raise ConfigError(msg) from None
 
 

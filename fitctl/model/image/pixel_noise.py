@@ -42,13 +42,19 @@ def noise_key(seeds: np.random.SeedSequence) -> int:
 
 
 def pixel_normals(key: int, number: int, pixels: int) -> Floats:
-    """Standard normals of one frame, shape (pixels,).
+    """Standard normals of one frame, shape (pixels,)."""
+    return normals_of_frames(key, number, 1, pixels)[0]
+
+
+def normals_of_frames(key: int, first: int, frames: int, pixels: int) -> Floats:
+    """Standard normals of frames with consecutive numbers, shape (frames, pixels).
 
     The hash is SplitMix64's (Steele, Lea and Flood, OOPSLA 2014): of the frame's number with the run's
     key, then of the pixel's index with the result.
     """
     # Arrays, because they wrap at 64 bits without a warning.
-    frame = mix(np.array([key], np.uint64) + np.array([number], np.uint64) * GOLDEN)
+    numbers = np.arange(first, first + frames, dtype=np.uint64)[:, None]
+    frame = mix(np.array([key], np.uint64) + numbers * GOLDEN)
     index = np.arange(1, pixels + 1, dtype=np.uint64)
     return quantiles()[mix(frame + index * GOLDEN) >> QUANTILE_SHIFT]
 

@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from fitctl.cli import main
 from fitctl.messages.commands import Acquire, Standby
 from fitctl.messages.modes import Mode
 
@@ -41,6 +42,15 @@ def test_a_mistake_is_named_before_anything_is_simulated(fitctl):
     status, _, err = fitctl("rehearse", "target", "22")
     assert status == 2
     assert "target takes AZ_PX EL_PX" in err
+
+
+def test_an_instrument_elsewhere_is_rehearsed_with_its_own_rig_file_only(capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["rehearse", "stop", "--remote", "key.toml"])
+    assert end.value.code == 2
+    assert (
+        "with --remote, name the rig file of that instrument with --rig" in capsys.readouterr().err
+    )
 
 
 @pytest.mark.parametrize("word", ["shutdown", "status", "events", "take-over"])

@@ -176,3 +176,30 @@ def test_two_consoles_do_not_log_each_other_out(serve):
 
     assert ask(first)[0] == ask(second)[0] == ask(first)[0] == 200
     assert ask(first, urlsplit(second).path)[0] == 403
+
+
+def test_a_port_that_another_server_has_gives_one_line_and_no_address(tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        folder = f"service.folder={tmp_path / 's'}"
+        ended = subprocess.run(
+            [
+                sys.executable,
+                "-m",
+                "fitctl",
+                "console",
+                "--web",
+                "--port",
+                str(port),
+                "--set",
+                folder,
+            ],
+            capture_output=True,
+            text=True,
+            timeout=LIMIT_S,
+            check=False,
+        )
+
+    assert ended.returncode == 2
+    assert ended.stdout == ""
+    assert f"console --web: port {port}: Address already in use; choose another" in ended.stderr
