@@ -378,23 +378,20 @@ class Invariants:
 
     def _acted_on(self, tick: Tick) -> None:
         oldest_s = self._oldest_s
-        if tick.frame_age_s > oldest_s and self._camera_well():
+        received_s = tick.mid_exposure_s + tick.frame_age_s
+        if tick.frame_age_s > oldest_s and self._camera_well(received_s):
             self.violated(
                 "a tick acts on the newest frame",
                 f"{tick.loop}: one of {tick.frame_age_s:.3f} s, at most {oldest_s:.3f} s",
             )
 
-    def _camera_well(self) -> bool:
-        """Nothing has been wrong with the camera's line for a while, and it loses no frames.
+    def _camera_well(self, received_s: float) -> bool:
+        """Nothing had been wrong with the camera's line for a while by then, and it loses no frames.
 
         If each frame that came during a stall is lost, one from before the stall is the newest.
         """
         line = self._lines["camera"]
-        return (
-            not line.is_bad
-            and "drops" not in line.wrong
-            and self._clock.now_s() - line.healed_s > WELL_S
-        )
+        return not line.is_bad and "drops" not in line.wrong and received_s - line.healed_s > WELL_S
 
     def _mode_changed(self, change: ModeChange) -> None:
         name = change.loop

@@ -136,10 +136,11 @@ def _open_unread(self: SiderostatServo) -> Any:
 
 
 def _one_slot(self: Loop, source: str, reason: str) -> None:
-    if not self.fire(Trigger.FAULT, reason) and reason not in self._last_failures.values():
+    is_new = all(reason != known for _, known in self._failures)
+    if not self.fire(Trigger.FAULT, reason) and is_new:
         self._report_event("error", reason)
-    self._last_failures.clear()
-    self._last_failures[source] = reason
+    self._failures.clear()
+    self._failures.append((source, reason))
 
 
 def _go_on_as_before(self: SiderostatServo, _position_rad: AzEl) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections import deque
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -37,6 +38,7 @@ from fitctl.stages.periodic import Periodic
 from fitctl.stages.siderostat import SiderostatStage
 
 Floats = NDArray[np.float64]
+_MOST_FAILURES = 20  # some reasons have a number that changes
 _SEVERITY: dict[Trigger, Severity] = {
     Trigger.FAULT: "error",
     Trigger.STAR_LOST: "warning",
@@ -102,7 +104,8 @@ class Loop(ABC):
         )
         self._journal = journal
         self._clock = journal.clock
-        self._last_failures: dict[str, str] = {}  # by what failed
+        # What failed and why, since devices were opened: each is reported once.
+        self._failures: deque[tuple[str, str]] = deque(maxlen=_MOST_FAILURES)
 
     # ------------------------------------------------------------ the tick
 
@@ -162,7 +165,7 @@ class Loop(ABC):
 
         `stack_v`, shape (3,), is what the D/A was found set to, where the loop has one.
         """
-        self._last_failures.clear()
+        self._failures.clear()
         self.quantities.begin()
         self.interlocks.reset_all(self._clock.now_s())
 
@@ -275,14 +278,16 @@ class Loop(ABC):
 
     def fail(self, source: str, reason: str) -> None:
         """Go to SAFE because `source` failed; where that changes nothing, report a reason that is new."""
-        if not self.fire(Trigger.FAULT, reason) and reason not in self._last_failures.values():
+        is_new = all(reason != known for _, known in self._failures)
+        if not self.fire(Trigger.FAULT, reason) and is_new:
             self._report_event("error", reason)
-        self._last_failures[source] = reason
+        if (source, reason) not in self._failures:
+            self._failures.append((source, reason))
 
     def device_failed(self, device: FailingDevice, error: Exception) -> None:
         """Record that a device failed while it was used, and :meth:`fail`."""
         reason = error_text(error)
-        if reason != self._last_failures.get(device):
+        if (device, reason) not in self._failures:
             self._journal.failure(self.name, device, error)
         self.fail(device, reason)
 

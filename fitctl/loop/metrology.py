@@ -286,6 +286,8 @@ class MetrologyLoop(Loop):
             # that comes loose drives neither this siderostat nor that of a stellar loop to its travel's end.
             error_rad = limited(error_rad, self._hold_most_rad)
         self._turn_beam(self.hold.step(error_rad, duration_s))
+        if self.siderostat.wanted_fraction > 1.0:
+            self.hold.begin()  # at its travel's end it does not turn the beam, and learns no rate
 
     def _error_rad(self, beam: Beam | None) -> Floats | None:
         if beam is None or beam.state is BeamState.LOST:

@@ -393,7 +393,9 @@ class StellarLoop(Loop):
 
     def _find_unmoved(self, star: Star | None) -> Finding | None:
         """What the stages do not move is not the loop's star; that is expected where it last was for sure."""
-        if self.mode is Mode.EXPERIMENT:  # moves the star off its target
+        link = self.star_motion.link
+        # An experiment moves the star off its target, and with a feedforward of 0 so does what the link turns.
+        if self.mode is Mode.EXPERIMENT or (link is not None and not link.matrix.any()):
             return None
         estimator, observation = self.star_finder.estimator, self.observation
         stages_px = estimator.stages_px(observation.beam_rad, observation.mirror_rad)
@@ -410,7 +412,7 @@ class StellarLoop(Loop):
     def _enter(self, source: Mode, motor_rad: Floats) -> None:
         self.following.begin()
         if source is Mode.EXPERIMENT:
-            self._end_experiment()
+            self._end_experiment(motor_rad)
         super()._enter(source, motor_rad)
         if self.mode is Mode.ACQUISITION:
             self._search_due = source in FOLLOWING
@@ -664,10 +666,16 @@ class StellarLoop(Loop):
         self._held_undone_rad = self.star_motion.undone_rad
         self._experiments.begin(name, drives, self.siderostat, self.mirror, now_s)
 
-    def _end_experiment(self) -> None:
+    def _end_experiment(self, motor_rad: Floats) -> None:
         held_rad = self._experiments.end(self.mirror)
-        if held_rad is not None and self.mode is not Mode.SAFE:
-            self.siderostat.undo_to(held_rad + self._undone_since_held())
+        if held_rad is None or self.mode is Mode.SAFE:
+            return
+        back_rad = held_rad + self._undone_since_held()
+        if self.interlocks.holds:
+            self._return_rad = back_rad
+            self.siderostat.hold(motor_rad)
+        else:
+            self.siderostat.undo_to(back_rad)
 
     # ------------------------------------------------------------ for the supervisor
 

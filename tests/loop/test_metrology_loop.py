@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from beam_bench import Bench
 
-from fitctl.drivers.interface import DeviceTimeout
+from fitctl.drivers.interface import DeviceRefused, DeviceTimeout
 from fitctl.logging.records import DeviceFailure, Event, ModeChange
 from fitctl.loop.search.spiral import NEAR
 from fitctl.messages.commands import Acquire
@@ -261,3 +261,32 @@ def test_the_tick_says_where_the_beam_is():
     assert tick.beam_state == "MEASURED"
     assert tick.beam_az_arcsec == pytest.approx(one.beam_arcsec()[0], abs=0.3)
     assert tick.noise_az_arcsec == pytest.approx(0.038, rel=0.05)
+
+
+def test_two_failures_of_one_device_that_alternate_are_reported_once_each():
+    one = bench().power_up()
+    silent = DeviceTimeout("photodiodes", "here", "a sample", "none")
+    refused = DeviceRefused("photodiodes", "here", "a sample", "a refusal")
+    for error in (silent, refused) * 3:
+        one.loop.device_failed("photodiodes", error)
+
+    assert one.loop.mode is Mode.SAFE
+    reported = [text for text in events(one) if "expected a sample" in text]
+    assert len(reported) == 2
+    assert len([r for r in one.records if isinstance(r, DeviceFailure)]) == 2
+
+
+def test_at_its_travels_end_a_siderostat_learns_no_rate_and_follows_the_beam_back():
+    def there_and_back(time_s):
+        drifted_s = max(0.0, time_s - 10.0)
+        return 1e-4 * min(drifted_s, max(0.0, 40.0 - drifted_s)), 0.0
+
+    one = bench(collector_m=there_and_back).held()
+    one.run(26.0 - one.clock.now_s())
+    one.loop.siderostat.travel_rad = np.abs(one.loop.siderostat.setpoint_rad).max()
+    one.run(6.0)
+    assert one.loop.siderostat.wanted_fraction > 1.0
+
+    one.run(4.0)  # 2 s ago the beam was back where the siderostat stopped
+    assert one.rms_arcsec(5.0) < 0.2
+    assert "LOCKED -> COARSE" not in str(events(one))

@@ -16,6 +16,12 @@ LIMIT_S = 60.0
 pytest.importorskip("textual_serve")
 
 
+def console_on(port, folder):
+    """The command that serves consoles on a port."""
+    command = [sys.executable, "-m", "fitctl", "console", "--web", "--port", str(port)]
+    return [*command, "--set", f"service.folder={folder / 's'}"]
+
+
 @pytest.fixture(scope="module")
 def serve(tmp_path_factory):
     """Starts consoles for browsers; gives the address of each."""
@@ -23,18 +29,7 @@ def serve(tmp_path_factory):
 
         def start():
             server = subprocess.Popen(
-                [
-                    *(
-                        sys.executable,
-                        "-m",
-                        "fitctl",
-                        "console",
-                        "--web",
-                        "--port",
-                        str(free_port()),
-                    ),
-                    *("--set", f"service.folder={tmp_path_factory.mktemp('w') / 's'}"),
-                ],
+                console_on(free_port(), tmp_path_factory.mktemp("w")),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 text=True,
@@ -181,19 +176,8 @@ def test_two_consoles_do_not_log_each_other_out(serve):
 def test_a_port_that_another_server_has_gives_one_line_and_no_address(tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        folder = f"service.folder={tmp_path / 's'}"
         ended = subprocess.run(
-            [
-                sys.executable,
-                "-m",
-                "fitctl",
-                "console",
-                "--web",
-                "--port",
-                str(port),
-                "--set",
-                folder,
-            ],
+            console_on(port, tmp_path),
             capture_output=True,
             text=True,
             timeout=LIMIT_S,

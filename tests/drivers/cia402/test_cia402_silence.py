@@ -65,6 +65,22 @@ def test_exchanging_keeps_the_drive_running(bench, amplifiers):
     assert bench.motors.enabled == [True, True]
 
 
+def test_an_exchange_with_a_drive_that_has_a_bus_of_its_own_waits_a_period_for_its_answer(
+    bench, amplifiers
+):
+    amplifiers.open()
+    amplifiers.enable()
+    reading_of(amplifiers)
+    bench.fault("freeze")
+    period_s, took_s = 1 / bench.siderostat.servo.rate_hz, []
+    for _ in range(10):
+        began_s = time.monotonic()
+        amplifiers.exchange(STILL)
+        took_s.append((time.monotonic() - began_s) / period_s)
+
+    assert 0.9 < min(took_s) < 1.5  # a machine that stands still does not do so in each of them
+
+
 def test_a_cut_link_is_unreachable_at_once_and_can_be_opened_again(bench, amplifiers):
     amplifiers.open()
     amplifiers.enable()

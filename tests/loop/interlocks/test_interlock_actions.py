@@ -97,6 +97,29 @@ def test_an_experiment_ends_when_its_stages_are_held(action):
     assert bench.loop.last_change.reason == bench.tripped["frame_age"].reason
 
 
+def test_the_siderostat_of_an_experiment_that_an_interlock_ends_stays_and_goes_back_after_it():
+    bench = with_action("freeze", modes="['EXPERIMENT', 'COARSE', 'VERNIER']")
+    loop, held_rad = bench.loop, bench.loop.siderostat.setpoint_rad.copy()
+    amplitude_px = 5.0
+    drive = Drive(
+        channel="siderostat_az", shape="square", amplitude=amplitude_px, frequency_hz=0.05, duration_s=60.0
+    )  # fmt: skip
+    assert bench.simulation.command(Experiment(name="step", drives=[drive])).accepted
+    bench.run(1.0)
+    late_frames(bench)
+    assert bench.until(lambda: loop.mode is Mode.COARSE, 2.0)
+    stopped_rad = loop.servo.position_rad
+    assert np.abs(stopped_rad - held_rad).max() > 0.5
+    bench.run(0.5)
+    assert loop.servo.position_rad == pytest.approx(stopped_rad, abs=0.02)
+
+    bench.heal()
+    bench.run(0.5)
+    assert bench.simulation.command(Reset(name="frame_age")).accepted
+    bench.run(0.5)
+    assert np.abs(loop.servo.position_rad - held_rad).max() < 0.5
+
+
 @pytest.mark.parametrize("action", ["freeze", "flatten"])
 def test_no_experiment_begins_while_the_stages_are_held(action):
     bench = with_action(action)
