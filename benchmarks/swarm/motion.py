@@ -186,7 +186,7 @@ class Motion:
                 )
 
     def stands(self, name: str, loop: Loop, now_s: float) -> None:
-        """A siderostat stands still in STANDBY, apart from jogs, and while its loop is held.
+        """A siderostat stays where it is in STANDBY, apart from jogs, and while its loop is held.
 
         In STANDBY it may go back to where it was held.
         """
@@ -209,8 +209,9 @@ class Motion:
         moved_rad = max(map(abs, map(operator.sub, motor_rad, stood_rad)))
         count_rad = math.tau / self._rig.loops[name].siderostat.encoder_counts_per_rev
         if moved_rad > _MOST_COUNTS * count_rad:
+            which = "whose loop is held" if is_held else "at rest"
             self._violated(
-                f"a siderostat {'whose loop is held' if is_held else 'that nobody moves'} stands still",
+                f"a siderostat {which} stays where it is",
                 f"{name}: {moved_rad:.4f} rad in {loop.mode.name}, {now_s - moves_s:.3f} s after it was moved",
             )
 
@@ -305,9 +306,11 @@ class Motion:
 
 def _is_held(loop: Loop) -> bool:
     """An interlock, or a search's wait for another loop, keeps the stages of a loop where they are."""
-    if loop.mode not in POINTING or loop.interlocks.holds:
-        return loop.mode in POINTING
-    if loop.mode is not Mode.ACQUISITION or not isinstance(loop, StellarLoop) or not loop._waits:
+    if loop.mode not in POINTING:
+        return False
+    if loop.interlocks.holds:
+        return True
+    if not (loop.mode is Mode.ACQUISITION and isinstance(loop, StellarLoop) and loop._waits):
         return False
     link = loop.star_motion.link
     return link is None or not link.holds

@@ -136,8 +136,8 @@ def _open_unread(self: SiderostatServo) -> Any:
 
 
 def _one_slot(self: Loop, source: str, reason: str) -> None:
-    is_new = all(reason != known for _, known in self._failures)
-    if not self.fire(Trigger.FAULT, reason) and is_new:
+    changed = self.fire(Trigger.FAULT, reason)
+    if not changed and all(reason != known for _, known in self._failures):
         self._report_event("error", reason)
     self._failures.clear()
     self._failures.append((source, reason))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fitctl.config import ARCSEC_PER_RAD
 from fitctl.config import Loop as LoopSettings
 from fitctl.controllers.feedforward import link_matrix
-from fitctl.loop.metrology import MetrologyLoop, newest_rad
+from fitctl.loop.metrology import MetrologyLoop
 from fitctl.messages.modes import Mode
 from fitctl.model.hysteresis import play
 from fitctl.model.optics import AzEl, Scales
@@ -213,7 +213,7 @@ class BacklashFeedforward:
         servos = self._link.loop.servo_state, own
         for index, (stage, servo) in enumerate(zip(self._stages, servos, strict=True)):
             # Halfway between where the motors are and where they are to be at the next tick.
-            motor_rad = 0.5 * (newest_rad(servo) + stage.setpoint_rad)
+            motor_rad = 0.5 * (servo.newest_rad + stage.setpoint_rad)
             beam_rad = play(self._beams_rad[index], motor_rad, self._half_rad[index])
             self._beams_rad[index] = beam_rad
             lost_rad.append(beam_rad - motor_rad)

@@ -21,6 +21,7 @@ from fitctl.drivers.interface import AzEl, Frame
 from fitctl.logging.records import FailingDevice, MetrologyTick, ModeChange, Place, Severity, Tick
 from fitctl.loop.interlocks import Interlocks
 from fitctl.loop.quantities import Quantities
+from fitctl.loop.search.spiral import SpiralSearch
 from fitctl.messages.commands import Acquire, AnyCommand
 from fitctl.messages.modes import (
     AT_REST,
@@ -35,6 +36,7 @@ from fitctl.messages.modes import (
 from fitctl.messages.telemetry import LoopState
 from fitctl.stages.journal import Journal, error_text
 from fitctl.stages.periodic import Periodic
+from fitctl.stages.servo import ServoState
 from fitctl.stages.siderostat import SiderostatStage
 
 Floats = NDArray[np.float64]
@@ -76,6 +78,7 @@ class Loop(ABC):
 
     transitions: ClassVar[tuple[Transition, ...]] = TRANSITIONS
     place_kind: ClassVar[type[Place]]
+    search: SpiralSearch
 
     def __init__(
         self,
@@ -106,6 +109,7 @@ class Loop(ABC):
         self._clock = journal.clock
         # What failed and why, since devices were opened: each is reported once.
         self._failures: deque[tuple[str, str]] = deque(maxlen=_MOST_FAILURES)
+        self._search_rests: tuple[bool, ...] = ()  # by what holds it
 
     # ------------------------------------------------------------ the tick
 
@@ -218,6 +222,18 @@ class Loop(ABC):
             self._report_event("info", f"interlock {name} is reset by hand")
         return why_not
 
+    def _rest_search(self, servo: ServoState, passed_s: float, holds: tuple[bool, ...]) -> None:
+        """While anything holds a search, its siderostat stops on its way, and for the search no time passes.
+
+        `holds` has each reason apart: where another takes over, the siderostat stops anew.
+        """
+        before, self._search_rests = self._search_rests, ()
+        if self.mode is Mode.ACQUISITION and any(holds):
+            self._search_rests = holds
+            self.search.delay(passed_s)
+            if holds != before:
+                self.siderostat.hold(servo.newest_rad)
+
     # ------------------------------------------------------------ modes
 
     def obey(self, trigger: Trigger, command: AnyCommand) -> None:
@@ -278,8 +294,8 @@ class Loop(ABC):
 
     def fail(self, source: str, reason: str) -> None:
         """Go to SAFE because `source` failed; where that changes nothing, report a reason that is new."""
-        is_new = all(reason != known for _, known in self._failures)
-        if not self.fire(Trigger.FAULT, reason) and is_new:
+        changed = self.fire(Trigger.FAULT, reason)
+        if not changed and all(reason != known for _, known in self._failures):
             self._report_event("error", reason)
         if (source, reason) not in self._failures:
             self._failures.append((source, reason))

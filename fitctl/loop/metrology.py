@@ -115,7 +115,7 @@ class MetrologyLoop(Loop):
         self.settings: MetrologySettings = rig.metrology_loops[name]
         settings = self.settings
         self.quantities: MetrologyQuantities
-        self.search = BeamSearch(rig, name)
+        self.search: BeamSearch = BeamSearch(rig, name)
         self.hold = BeamHold(settings.hold.crossover_hz, settings.hold.second_integrator_hz)
         self._array = PhotodiodeArray(settings.sensor, settings.acquisition.detection_sigma)
         self._photodiodes = photodiodes
@@ -131,7 +131,7 @@ class MetrologyLoop(Loop):
         self._period_s = rig.camera.period_s
         self._sky_arcsec_per_px = ARCSEC_PER_RAD / sky_px_per_rad(rig)
         self._limits = metrology_limits(rig, name)
-        self._ready = self._search_rests = False
+        self._ready = False
         self._sampled_s = math.nan
         self._ticked_s = self._requested_s = math.nan
         self.lost = self.in_reach = self.out_of_reach = 0  # samples in a row
@@ -180,18 +180,10 @@ class MetrologyLoop(Loop):
         duration_s = min(since_s, MOST_TICK_S)
         self._ticked_s = now_s
         law, holds = self._laws.get(self.mode), self.interlocks.holds
-        self._rest_search(sensed.servo, since_s, holds=holds)
+        self._rest_search(sensed.servo, since_s, (holds,))
         if law is not None and not holds:
             law(sensed, duration_s)
         self._decided_s = self._clock.now_s()
-
-    def _rest_search(self, servo: ServoState, passed_s: float, *, holds: bool) -> None:
-        """A siderostat that a search has sent far away stops on its way; for the search no time passes."""
-        before, self._search_rests = self._search_rests, holds and self.mode is Mode.ACQUISITION
-        if self._search_rests:
-            self.search.delay(passed_s)
-            if not before:
-                self.siderostat.hold(newest_rad(servo))
 
     def send(self) -> None:
         """Ask for the next sample."""
@@ -438,11 +430,6 @@ class MetrologyLoop(Loop):
             decide_s=self._decided_s - self._sensed_s,
             requested_s=self._requested_s,
         )
-
-
-def newest_rad(servo: ServoState) -> Floats:
-    """Motor angles of the newest reading of a tick, shape (2,)."""
-    return servo.position_rad if servo.reading is None else np.array(servo.reading.position_rad)
 
 
 def limited(both: Floats, most: float) -> Floats:

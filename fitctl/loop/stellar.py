@@ -26,7 +26,7 @@ from fitctl.loop.following import Following
 from fitctl.loop.learning import Learning, is_other_light
 from fitctl.loop.link import BacklashFeedforward, Link
 from fitctl.loop.loop import Loop
-from fitctl.loop.metrology import MetrologyLoop, newest_rad
+from fitctl.loop.metrology import MetrologyLoop
 from fitctl.loop.observation import Observation
 from fitctl.loop.pointing import Pointing, error_from
 from fitctl.loop.quantities import StellarQuantities, stellar_places
@@ -92,7 +92,7 @@ class StellarLoop(Loop):
         scale = scales(rig, self.settings)
         self.star_motion = StarMotion(self.settings, scale, rig.camera.period_s)
         self.star_finder = StarFinder(rig, name, self.target_px, self._report_event)
-        self.search = StarSearch(rig, name, self.star_finder, lambda: self.target_px)
+        self.search: StarSearch = StarSearch(rig, name, self.star_finder, lambda: self.target_px)
         self.following = Following(self.settings, scale)
         self.pointing = Pointing(rig, name, self.target_px, design)
         self.learning = Learning(rig, name)
@@ -102,7 +102,6 @@ class StellarLoop(Loop):
         self._experiments = Experiments(name, scale.motor_px_per_rad, journal)
         self._tick_records = TickRecords(rig, name)
         self._flattened = self._held = False
-        self._search_rests = False, False  # for an interlock; for another loop
         self._return_rad: Floats | None = None  # whereto an interlock has stopped the siderostat
         self._moved_s = journal.clock.now_s()
         self._search_due: bool | None = None  # whether it is for a star that was followed
@@ -249,7 +248,8 @@ class StellarLoop(Loop):
         waits = self._waits
         # Without a frame to track by, the stages wait where they are.
         self._held = stopped or waits or (self.mode in TRACKING and observation.frame is None)
-        self._rest_search(observation, stopped=stopped, waits=waits)
+        passed_s, self._moved_s = observation.now_s - self._moved_s, observation.now_s
+        self._rest_search(observation.servo, passed_s, (stopped, waits))
         if not self._held:
             self._laws[self.mode](observation)
         self._follow_plays(observation)
@@ -260,16 +260,6 @@ class StellarLoop(Loop):
         due = self.mode is Mode.ACQUISITION and self._search_due is not None
         return due or (self.mode in TRACKING and bool(self.waits_for))
 
-    def _rest_search(self, observation: Observation, *, stopped: bool, waits: bool) -> None:
-        """A siderostat that a search has sent far away stops on its way; for the search no time passes."""
-        passed_s, self._moved_s = observation.now_s - self._moved_s, observation.now_s
-        before, self._search_rests = self._search_rests, (False, False)
-        if self.mode is Mode.ACQUISITION and (stopped or waits):
-            self._search_rests = stopped, waits
-            self.search.delay(passed_s)
-            if self._search_rests != before:
-                self.siderostat.hold(newest_rad(observation.servo))
-
     def _rest_return(self, observation: Observation, *, stopped: bool) -> None:
         """A siderostat on its way back to its star stops for an interlock, and goes on after it."""
         follows = self.mode in FOLLOWING
@@ -279,7 +269,7 @@ class StellarLoop(Loop):
             self._return_rad = None
         elif self._return_rad is None and stopped and follows and self.waits_for:
             self._return_rad = self.siderostat.wanted_rad
-            self.siderostat.hold(newest_rad(observation.servo))
+            self.siderostat.hold(observation.servo.newest_rad)
 
     def _follow_plays(self, observation: Observation) -> None:
         """The mirror makes up for backlash in VERNIER only, and then from where the plays are."""

@@ -74,6 +74,12 @@ class ServoState(NamedTuple):
     following_rad: float
     round_trip_s: float
 
+    @property
+    def newest_rad(self) -> Floats:
+        """Motor angles of the newest reading, shape (2,)."""
+        reading = self.reading
+        return self.position_rad if reading is None else np.array(reading.position_rad)
+
 
 class SiderostatServo:
     """One loop's siderostat.

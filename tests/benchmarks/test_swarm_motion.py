@@ -84,8 +84,8 @@ def test_a_drive_that_watches_nobody_turns_on_while_it_cannot_be_reached():
     assert watched.go_on(10.0) == []
 
 
-MOVES = ["a siderostat that nobody moves stands still"]
-SLEWS = ["a siderostat whose loop is held stands still"]
+MOVES = ["a siderostat at rest stays where it is"]
+SLEWS = ["a siderostat whose loop is held stays where it is"]
 
 
 def turn(watched, turned_rad=0.01):

@@ -66,7 +66,7 @@ FOUND = {
             Strike(at_s=1.5, device="camera", fault="slow", size=25.0, lasts_s=5.0),
             settings=['interlocks.frame_age.modes=["ACQUISITION"]'],
         ),
-        "a siderostat whose loop is held stands still",
+        "a siderostat whose loop is held stays where it is",
     ),
     "star-forgotten": (
         plan(

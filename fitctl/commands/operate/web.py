@@ -65,9 +65,8 @@ def serve_console(rig_arguments: Sequence[str], port: int) -> None:
 
     command = shlex.join([sys.executable, "-m", "fitctl", "console", *rig_arguments])
     try:
-        socket.create_server(
-            (HOST, port)
-        ).close()  # an address is printed before the server has its port
+        # The server prints its address before it binds the port.
+        socket.create_server((HOST, port)).close()
         GuardedServer(command, host=HOST, port=port, title="fitctl").serve()
     except OSError as error:
         why = os.strerror(error.errno or 0)

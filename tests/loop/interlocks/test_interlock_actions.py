@@ -100,10 +100,8 @@ def test_an_experiment_ends_when_its_stages_are_held(action):
 def test_the_siderostat_of_an_experiment_that_an_interlock_ends_stays_and_goes_back_after_it():
     bench = with_action("freeze", modes="['EXPERIMENT', 'COARSE', 'VERNIER']")
     loop, held_rad = bench.loop, bench.loop.siderostat.setpoint_rad.copy()
-    amplitude_px = 5.0
-    drive = Drive(
-        channel="siderostat_az", shape="square", amplitude=amplitude_px, frequency_hz=0.05, duration_s=60.0
-    )  # fmt: skip
+    square = {"shape": "square", "amplitude": 5.0, "frequency_hz": 0.05, "duration_s": 60.0}
+    drive = Drive(channel="siderostat_az", **square)
     assert bench.simulation.command(Experiment(name="step", drives=[drive])).accepted
     bench.run(1.0)
     late_frames(bench)
