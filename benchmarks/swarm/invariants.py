@@ -318,6 +318,7 @@ class Invariants:
                 self.own_stars.pointed_at(name)
             elif isinstance(command, Experiment):
                 self._experiment_s[name] = experiment_s(command.drives)
+                self.motion.experiment_began(name, command.drives)
 
     def _collector_is_to_stop(self, *, is_so: bool) -> None:
         if not (is_so and self._collector_is_stopped):

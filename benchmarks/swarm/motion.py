@@ -17,7 +17,9 @@ from fitctl.drivers.interface import AzEl, Pose
 from fitctl.loop.loop import Loop
 from fitctl.loop.stellar import StellarLoop
 from fitctl.messages.modes import AT_REST, POINTING, Mode
+from fitctl.model.drives import SIDEROSTAT, Drive
 from fitctl.model.plant import Plant
+from fitctl.stages.injector import PERIOD_S
 from fitctl.supervisor.supervisor import Supervisor
 
 Floats = NDArray[np.float64]
@@ -86,6 +88,7 @@ class Motion:
         self._zero_is_lost = zero_is_lost
         self._mirror_moved_s: dict[str, float] = {}  # by loop: when something moved it that may
         self._sent_rad_s: dict[str, AzEl] = {}
+        self._mirror_only_returns: dict[str, bool] = {}  # by loop: in its newest experiment
         self._slowly: dict[str, bool] = {}  # by loop: the last write was in a mode of rest
         self._standing_rad: dict[str, list[float]] = {}
         # What every period needs, once.
@@ -245,17 +248,29 @@ class Motion:
         was_slow, self._slowly[name] = self._slowly.get(name, False), slowly
         if loop.mode is Mode.VERNIER and decided_here:
             self._within_range(name, self.supervisor)
+        if loop.mode is Mode.EXPERIMENT and self._mirror_only_returns.get(name, False):
+            moved_s = self._mirror_moved_s.get(name, -math.inf)
+            if self._dacs_are_well() and self._clock.now_s() - moved_s > WELL_S:
+                self._no_faster_than_slew(name, volts, before_v, PERIOD_S)
         if not (slowly and (was_slow or decided_here)):
             return
-        step_v = max(abs(v - b) for v, b in zip(wanted_v, before_v.tolist(), strict=True))
-        most_v = fsm.slew_v_per_s * self._rig.camera.period_s * _SLACK + fsm.dac.step_v
+        step_v = self._no_faster_than_slew(name, volts, before_v, self._rig.camera.period_s)
+        if step_v > fsm.dac.step_v:
+            self._mirror_rests(name, loop, step_v)
+
+    def _no_faster_than_slew(
+        self, name: str, volts: Floats, before_v: Floats, period_s: float
+    ) -> float:
+        """A mirror on its way to where it rests is written to once a period; by how much it is now."""
+        fsm = self._stellar_loops[name].fsm
+        step_v = max(abs(v - b) for v, b in zip(volts.tolist(), before_v.tolist(), strict=True))
+        most_v = fsm.slew_v_per_s * period_s * _SLACK + fsm.dac.step_v
         if not step_v <= most_v:
             self._violated(
                 "the mirror rests no faster than its slew",
                 f"{name}: {step_v:.3f} V in one write, at most {most_v:.3f} V",
             )
-        if step_v > fsm.dac.step_v:
-            self._mirror_rests(name, loop, step_v)
+        return step_v
 
     def _dacs_are_well(self) -> bool:
         """No D/A has made a loop wait with its writes recently."""
@@ -298,6 +313,10 @@ class Motion:
                 "a mirror at rest stays where it is",
                 f"{name}: {step_v:.3f} V in one write after {rested_s:.2f} s in {loop.mode.name}",
             )
+
+    def experiment_began(self, name: str, drives: list[Drive]) -> None:
+        """An experiment was accepted; if it does not move a mirror, that returns to its bias."""
+        self._mirror_only_returns[name] = all(drive.channel in SIDEROSTAT for drive in drives)
 
     def mirror_moved(self, name: str) -> None:
         """A loop's D/A has gone to its safe voltages by itself, or somebody commands another bias."""

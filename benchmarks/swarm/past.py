@@ -24,9 +24,11 @@ from fitctl.loop.search.attribution import Attribution
 from fitctl.loop.stellar import StellarLoop
 from fitctl.messages.commands import AnyCommand, Experiment, Reply
 from fitctl.messages.modes import Mode, Trigger
+from fitctl.model.drives import Drive
 from fitctl.sequences.contact import Contact
 from fitctl.sequences.view import View
 from fitctl.service import service
+from fitctl.stages.injector import Injector
 from fitctl.stages.mirror import MirrorStage
 from fitctl.stages.servo import SiderostatServo
 from fitctl.stages.siderostat import SiderostatStage
@@ -209,6 +211,10 @@ def _experiments_on(self: StellarLoop, observation: Observation) -> None:
         _EVALUATE_WAITING(self, observation)
 
 
+def _starts_at_the_bias(self: Injector, drives: list[Drive], start_s: float, stack_v: Any) -> None:
+    _INJECT(self, drives, start_s, 0.0 * stack_v + self._bias_v)
+
+
 def _find_nothing(self: MirrorStage) -> None:
     self._known_s = self._clock.now_s()
 
@@ -228,6 +234,7 @@ def _counts_from_the_search(self: StellarLoop, motor_rad: Any) -> None:
 
 
 _ASK = PiezoWatch.ask
+_INJECT = Injector.start
 _RECALL = StellarLoop.recall
 _START_SEARCH = StellarLoop._start_search
 _EVALUATE_WAITING = StellarLoop._evaluate_waiting
@@ -374,6 +381,11 @@ DEFECTS = {
             (supervisor, "obey_loop_command", _experiment_though_it_waits),
             (StellarLoop, "_evaluate_waiting", _experiments_on),
         ],
+    ),
+    "bias-at-once": Defect(
+        "f765651b",
+        "an experiment that begins with the mirror off its bias writes the bias at once",
+        [(Injector, "start", _starts_at_the_bias)],
     ),
     "obeyed-late": Defect(
         "223a2238",

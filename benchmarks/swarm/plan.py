@@ -105,6 +105,7 @@ _LONG_STALL, _SILENT = 0.3, 0.5  # fractions of disturbed rests
 _LEARNER, _LEARNS = 0.4, 0.5  # fraction of runs with a learner, and of these, with `learn = "on"`
 _REPORTS_S = 5.0  # mean time between a learner's reports
 _EXPERIMENTS = 0.4  # fraction of runs with faults in which experiments are met by something
+_OFF_BIAS = 0.5  # fraction of these that begin soon after another target
 _TO_THE_END = 0.1  # fraction of runs in which a siderostat is jogged to the end of its travel
 _JOG_ARCSEC, _JOGS = 100.0, 14  # each, and so many
 _COLLECTOR = 0.4  # fraction of the testbed's runs in which its collector is moved on purpose
@@ -384,8 +385,14 @@ def _jogged_to_the_end(random: Random, at_s: float, loops: tuple[str, ...]) -> l
 def _met_experiment(
     random: Random, at_s: float, loops: list[str], devices: list[str], faults: list[str]
 ) -> list[Happening]:
-    """An experiment with one loop, and what comes meanwhile: a command, a fault or a stall."""
+    """An experiment with one loop, and what comes meanwhile: a command, a fault or a stall.
+
+    Some begin while the mirror takes the star to another target.
+    """
     loop, who = random.choice(loops), OPERATORS[0]
+    target = msgspec.structs.replace(drawn_target(random), loop=loop)
+    moved_s = at_s - random.uniform(0.1, 1.0)
+    moves = [Order(at_s=moved_s, who=who, command=target)] * (random.random() < _OFF_BIAS)
     experiment = msgspec.structs.replace(drawn_experiment(random), loop=loop)
     meets_s = at_s + 10 ** random.uniform(-2.0, 1.0)
     what = random.choice((*_MEETS_EXPERIMENT, "fault", "stall"))
@@ -397,7 +404,8 @@ def _met_experiment(
         command = _drawn_command(random, what, [], (loop,))
         meets = [Order(at_s=meets_s, who=who, command=command)]
     return [
-        Order(at_s=at_s - 0.1, who=who, command=TakeOver()),
+        Order(at_s=moved_s - 0.1, who=who, command=TakeOver()),
+        *moves,
         Order(at_s=at_s, who=who, command=experiment),
         *meets,
     ]

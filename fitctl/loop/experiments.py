@@ -59,7 +59,7 @@ class Experiments:
             ExperimentStart(time_s=now_s, loop=self._loop_name, name=name, drives_json=text)
         )
         self._report_injection(now_s, mirror.stack_v)
-        mirror.injector.start(drives, now_s)
+        mirror.injector.start(drives, now_s, mirror.stack_v)
 
     def setpoint_rad(self, now_s: float) -> Floats | None:
         """Where the siderostat shall be, shape (2,); None once all motions are done."""

@@ -658,7 +658,8 @@ class StellarLoop(Loop):
 
     def _end_experiment(self, motor_rad: Floats) -> None:
         held_rad = self._experiments.end(self.mirror)
-        if held_rad is None or self.mode is Mode.SAFE:
+        # After a wait, the star is pulled in from where the experiment has left it.
+        if held_rad is None or self.mode is Mode.SAFE or self.waits_for:
             return
         back_rad = held_rad + self._undone_since_held()
         if self.interlocks.holds:

@@ -388,7 +388,7 @@ class LoggedInjector(Injector):
     """What was written outside the ticks, as the log has it."""
 
     def __init__(self, dac: LoggedDac, clock: Clock) -> None:
-        super().__init__(dac, clock, np.zeros((3, 2)), 0.0, 0.0)
+        super().__init__(dac, clock, np.zeros((3, 2)), 0.0, 0.0, 0.0)
         self._logged: list[Injection] = []
 
     def load_step(self, step: LoggedStep, loop: str) -> None:

@@ -39,7 +39,7 @@ class Injector:
     clock : Clock
     stack_v_per_px : array, shape (3, 2)
         Stack voltages of one pixel of mirror motion, by Eq. 1.
-    bias_v, full_scale_v : float
+    bias_v, full_scale_v, slew_v_per_s : float
     """
 
     def __init__(
@@ -49,6 +49,7 @@ class Injector:
         stack_v_per_px: Floats,
         bias_v: float,
         full_scale_v: float,
+        slew_v_per_s: float,
     ) -> None:
         self.period_s = PERIOD_S
         self.threaded = False
@@ -60,8 +61,10 @@ class Injector:
         self._stack_v_per_px = stack_v_per_px
         self._bias_v = bias_v
         self._full_scale_v = full_scale_v
+        self._most_slew_v = slew_v_per_s * PERIOD_S
         self._drives: list[Drive] = []
         self._start_s = 0.0
+        self._off_bias_v = np.zeros(3)  # what is left of where the mirror was before
         self._running = threading.Event()
         self._turn = threading.Lock()  # one writer of the D/A at a time
         self._written: deque[Injection] = deque()
@@ -74,9 +77,13 @@ class Injector:
             + self._stack_v_per_px @ channel_values(drives, FSM, time_s)
         )
 
-    def start(self, drives: list[Drive], start_s: float) -> None:
-        """Write from now on."""
+    def start(self, drives: list[Drive], start_s: float, stack_v: Floats) -> None:
+        """Write from now on, with the D/A at `stack_v`, shape (3,).
+
+        From there the mirror goes to its bias, no faster than its slew, while it makes the motions.
+        """
         self._drives, self._start_s, self.fault = drives, start_s, None
+        self._off_bias_v = stack_v - self._bias_v
         self._written.clear()
         self._running.set()
 
@@ -100,7 +107,7 @@ class Injector:
                 return
             try:
                 wanted = self.volts(self._drives, self._clock.now_s() - self._start_s)
-                volts = np.clip(wanted, 0.0, self._full_scale_v)
+                volts = np.clip(wanted + self._off_bias_v, 0.0, self._full_scale_v)
                 self._dac.send_v(volts)
                 self._dac.confirm()
             except Exception as error:  # else the thread would end, and nothing ever move again
@@ -108,6 +115,8 @@ class Injector:
                 self._running.clear()
                 return
             self._written.append(Injection(self._clock.now_s(), volts))
+            left_v = self._off_bias_v
+            self._off_bias_v = left_v - np.clip(left_v, -self._most_slew_v, self._most_slew_v)
 
     def wait(self) -> None:
         """Until an experiment runs, or for a while."""

@@ -85,6 +85,7 @@ class MirrorStage:
             stack_v_per_px(fsm.stack_radius_m, fsm.stack_scale_m_per_v, mirror_px_per_rad),
             fsm.bias_v,
             fsm.dac.full_scale_v,
+            fsm.slew_v_per_s,
         )
         self._rest_v = self.stack_v
         self._fsm = fsm

@@ -6,9 +6,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fitctl.config import Rig
-from fitctl.controllers.attribution import FOLLOWED_PX, is_within
+from fitctl.controllers.attribution import FOLLOWED_PX
 from fitctl.loop.loop import Loop
 from fitctl.loop.metrology import MetrologyLoop
 from fitctl.loop.search.spiral import refused_area
@@ -25,12 +26,14 @@ from fitctl.messages.commands import (
     SetBiasOffset,
     SetTarget,
 )
-from fitctl.messages.modes import WITH_WINDOW, Trigger, transition
+from fitctl.messages.modes import FOLLOWING, WITH_WINDOW, Trigger, transition
 from fitctl.stages.drives import refused_drives
 from fitctl.supervisor.jogging import jog_siderostats, offset_mirrors
 
+Floats = NDArray[np.float64]
 Loops = Sequence[Loop]
 StellarLoops = Sequence[StellarLoop]
+_WAY_PLACES = 200  # no farther apart than 0.3 px
 
 
 def set_target(rig: Rig, loops: StellarLoops, command: SetTarget) -> str:
@@ -40,15 +43,28 @@ def set_target(rig: Rig, loops: StellarLoops, command: SetTarget) -> str:
     if not rig.camera.window_fits(command.az_px, command.el_px):
         return f"target {rig.camera.no_window_text(command.az_px, command.el_px)}"
     (loop,) = loops
+    target_px = np.array([command.az_px, command.el_px])
+    from_px = np.array(loop.pointing.command_px) if loop.mode in FOLLOWING else target_px
     for other in loop.others:
-        az_px, el_px = other.target_px.tolist()
-        if is_within(command.az_px, command.el_px, az_px, el_px, FOLLOWED_PX):
+        if _comes_near(from_px, target_px, other.target_px):
+            az_px, el_px = other.target_px.tolist()
             return (
-                f"target {command.az_px:g} {command.el_px:g}: loop {other.name} holds its star at {az_px:g} "
-                f"{el_px:g}; expected more than {FOLLOWED_PX:g} px between them along one axis"
+                f"target {command.az_px:g} {command.el_px:g}: there or on the straight way there the star "
+                f"comes too near that of loop {other.name}, at {az_px:g} {el_px:g}; expected more than "
+                f"{FOLLOWED_PX:g} px between them along one axis"
             )
-    loop.target_px = np.array([command.az_px, command.el_px])
+    loop.target_px = target_px
     return ""
+
+
+def _comes_near(from_px: Floats, to_px: Floats, place_px: Floats) -> bool:
+    """Whether what goes straight, each shape (2,), comes so near to a place that the two may be exchanged.
+
+    What begins so near may go away from it.
+    """
+    way_px = np.linspace(from_px, to_px, _WAY_PLACES)
+    is_clear = np.abs(way_px - place_px).max(axis=1) > FOLLOWED_PX
+    return not is_clear[is_clear.argmax() :].all()
 
 
 def look(rig: Rig, loops: StellarLoops, command: Look) -> str:

@@ -7,8 +7,9 @@ import pytest
 
 from benchmarks.swarm.devices.hexapod import SwarmHexapod
 from fitctl.drivers.interface import Pose
-from fitctl.messages.commands import Jog, Reply
+from fitctl.messages.commands import Experiment, Jog, Reply
 from fitctl.messages.modes import Mode
+from fitctl.model.drives import Drive
 from tests.benchmarks.watched import TESTBED, TICK_S, Rig
 
 
@@ -203,6 +204,30 @@ def test_the_first_write_at_rest_is_within_the_slew_if_it_was_decided_there(sinc
     watched.invariants.motion.volts("right", np.full(3, 7.0), np.full(3, 5.0))
 
     jumps = since_s > 0.001 and mode is not Mode.VERNIER
+    assert watched.go_on(0.1) == ["the mirror rests no faster than its slew"] * jumps
+
+
+@pytest.mark.parametrize(
+    ("channel", "step_v", "moved", "jumps"),
+    [
+        ("siderostat_az", 1.0, False, True),
+        ("siderostat_az", 0.36, False, False),
+        ("siderostat_az", 1.0, True, False),
+        ("fsm_az", 1.0, False, False),
+    ],
+)
+def test_an_experiment_that_does_not_move_the_mirror_brings_it_to_its_bias_within_the_slew(
+    channel, step_v, moved, jumps
+):
+    watched = Rig(mode=Mode.EXPERIMENT)
+    drive = Drive(channel=channel, shape="sine", amplitude=1.0, frequency_hz=1.0, duration_s=60.0)
+    asks = Experiment(loop="right", name="try", drives=[drive])
+    watched.invariants.answered(asks, Reply(accepted=True))
+    watched.go_on(5.0)
+    if moved:  # by the D/A's own watchdog
+        watched.invariants.motion.mirror_moved("right")
+    watched.invariants.motion.volts("right", np.full(3, 5.0), np.full(3, 5.0 + step_v))
+
     assert watched.go_on(0.1) == ["the mirror rests no faster than its slew"] * jumps
 
 

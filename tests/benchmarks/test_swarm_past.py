@@ -14,10 +14,11 @@ from fitctl.messages.commands import (
     Recover,
     Release,
     SetBiasOffset,
+    SetTarget,
     Standby,
     Stop,
 )
-from fitctl.model.drives import standstill
+from fitctl.model.drives import Drive, standstill
 from tests.benchmarks.plans import gives, plan
 
 
@@ -27,6 +28,9 @@ def _expected(loop, az, el):
 
 FAR = Acquire(expected_az_sky_arcsec=600.0, expected_el_sky_arcsec=0.0)
 BACK = Acquire(expected_az_sky_arcsec=-200.0, expected_el_sky_arcsec=0.0)
+SIDEROSTAT_RESTS = Drive(
+    channel="siderostat_az", shape="sine", amplitude=0.0, frequency_hz=1.0, duration_s=1.0
+)
 KILLED_S = (40.0, 52.0, 64.0, 76.0)  # late in a search for a star behind a cloud
 FOUND = {
     "watchdog-step": (
@@ -35,6 +39,16 @@ FOUND = {
             gives(1.5, SetBiasOffset(az_urad=100.0, el_urad=0.0)),
             Stall(at_s=3.0, lasts_s=1.6),
             gives(6.0, Standby()),
+        ),
+        "the mirror rests no faster than its slew",
+    ),
+    "bias-at-once": (
+        plan(
+            gives(0.1, Standby()),
+            gives(2.0, Acquire()),
+            gives(15.0, SetTarget(loop="right", az_px=26.0, el_px=22.0)),
+            gives(16.0, Experiment(loop="right", name="rest", drives=[SIDEROSTAT_RESTS])),
+            duration_s=20.0,
         ),
         "the mirror rests no faster than its slew",
     ),

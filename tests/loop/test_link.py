@@ -19,7 +19,7 @@ from fitctl.messages.commands import (
     Stop,
 )
 from fitctl.messages.modes import Mode
-from fitctl.model.drives import standstill
+from fitctl.model.drives import Drive, standstill
 from fitctl.simulation.simulation import Simulation
 from fitctl.simulation.statistics import true_residual_rms
 
@@ -547,6 +547,31 @@ def test_an_experiment_meanwhile_changes_nothing_of_that(held):
     held.run(1.5)
     assert held.first_change(LEFT, trigger="EXPERIMENT_DONE")
     assert siderostat.setpoint_rad == pytest.approx(before_rad, abs=0.2)
+
+
+@pytest.mark.long
+def test_the_stages_of_an_experiment_that_the_loss_of_the_link_ends_stay_until_it_is_back(held):
+    left, held_rad = held.loop(LEFT), held.loop(LEFT).siderostat.setpoint_rad.copy()
+    square = {"shape": "square", "amplitude": 5.0, "frequency_hz": 0.02, "duration_s": 60.0}
+    drive = Drive(channel="siderostat_az", **square)
+    assert held.command(Experiment(loop=LEFT, name="step", drives=[drive])).accepted
+    held.run(1.0)
+    held.laser(0.0)
+    while not left.waits_for:
+        held.run(0.02)
+    stopped_rad = left.servo.position_rad
+    held.run(2.0)
+    assert held.first_change(LEFT, trigger="EXPERIMENT_DONE")
+    assert np.abs(stopped_rad - held_rad).max() > 0.5
+    assert left.servo.position_rad == pytest.approx(stopped_rad, abs=0.05)
+
+    held.records.clear()
+    held.laser(1.0)
+    held.until(metrology=Mode.LOCKED, left=Mode.VERNIER)
+    changes = [record for record in held.records if isinstance(record, ModeChange)]
+    assert not [
+        change for change in changes if change.loop == LEFT and change.target == "ACQUISITION"
+    ]
 
 
 @pytest.mark.long

@@ -6,7 +6,14 @@ from instruments.simulated import SlowExecutor, events_of, failing, mode_of, unt
 
 from fitctl.config import default_rig_path, load_rig
 from fitctl.drivers.interface import DeviceTimeout, DeviceUnreachable
-from fitctl.logging.records import CommandRecord, DeviceHealth, FrameRecord, PiezoReading, Tick
+from fitctl.logging.records import (
+    CommandRecord,
+    DeviceHealth,
+    FrameRecord,
+    ModeChange,
+    PiezoReading,
+    Tick,
+)
 from fitctl.messages.commands import (
     Acquire,
     Off,
@@ -405,7 +412,36 @@ def test_two_stars_are_not_sent_to_one_place():
     accepted = pair.command(SetTarget(loop="right", az_px=left[0] + 5.0, el_px=left[1] - 7.0))
 
     assert refused.text == (
-        "target 17 15: loop left holds its star at 12 20; expected more than 6 px between them along one axis"
+        "target 17 15: there or on the straight way there the star comes too near that of loop left, at 12 20; "
+        "expected more than 6 px between them along one axis"
     )
     assert accepted.accepted
     assert pair.command(SetTarget(loop="right", az_px=right[0], el_px=right[1])).accepted
+
+
+@pytest.mark.long
+def test_a_star_that_is_held_is_not_sent_past_another_ones_place():
+    records = []
+    rig = load_rig(default_rig_path().with_name("two-stars.toml"))
+    pair = Simulation(rig, 0, record=records.append)
+    right, left = (pair.supervisor.loops[name].target_px.tolist() for name in ("right", "left"))
+    beyond = SetTarget(loop="left", az_px=34.5, el_px=left[1])
+    back = SetTarget(loop="left", az_px=left[0], el_px=left[1])
+    assert pair.command(beyond).accepted  # nothing is held, and nothing goes there
+    assert pair.command(back).accepted
+    pair.acquire()
+    while any(loop.mode is not Mode.VERNIER for loop in pair.supervisor.loops.values()):
+        assert pair.clock.now_s() < 60
+        pair.run(0.5)
+    records.clear()
+
+    refused = pair.command(beyond)
+    assert f"too near that of loop right, at {right[0]:g} {right[1]:g};" in refused.text
+
+    for az_px, el_px in ((left[0], 32.0), (34.5, 32.0), (34.5, left[1])):  # round it
+        assert pair.command(SetTarget(loop="left", az_px=az_px, el_px=el_px)).accepted
+        pair.run(12.0)
+    changes = [record for record in records if isinstance(record, ModeChange)]
+    assert not [change for change in changes if change.target == "ACQUISITION"]
+    held_px = pair.supervisor.loops["left"].pointing.command_px
+    assert held_px == pytest.approx((34.5, left[1]), abs=0.1)
