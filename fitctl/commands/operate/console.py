@@ -27,6 +27,7 @@ from fitctl.tui.rewind.logged import LoggedRun
 from fitctl.tui.wire import NoLink
 
 _NICENESS = 5
+_WEB_PORT = 8000
 _NO_TERMINAL = (
     "console: needs a terminal for input, output and error output. Without one, use fitctl watch, "
     "fitctl status, or fitctl console --web for a browser"
@@ -55,14 +56,23 @@ def console(
         bool, typer.Option("--web", help="Open the console in a browser on this machine.")
     ] = False,
     port: Annotated[
-        int, typer.Option(min=1, max=65535, help="Port of --web, on 127.0.0.1.")
-    ] = 8000,
+        int | None,
+        typer.Option(
+            min=1,
+            max=65535,
+            show_default=str(_WEB_PORT),
+            help="Port of --web, on 127.0.0.1.",
+        ),
+    ] = None,
 ) -> None:
     """Open the operator console on a running supervisor.
 
     With --remote, also name the rig file with --rig if you need sequences and the margins on the screen Loop.
     With --log or --latest, the console shows a log: it needs no supervisor and sends no commands.
     """
+    if port is not None and not web:
+        msg = f"console: --port {port} is for --web; add --web, or leave out --port"
+        raise ConfigError(msg)
     # A browser's page runs this command too, with a driver of textual-serve in place of a terminal.
     if not (web or "TEXTUAL_DRIVER" in os.environ or has_terminal()):
         raise ConfigError(_NO_TERMINAL)
@@ -79,7 +89,7 @@ def console(
     client = connect("console", rig, overrides, remote)
     if web:
         client.close()  # what is wrong with the rig is said here, not in the browser
-        serve_console([*(arguments or ()), *remote_arguments], port)
+        serve_console([*(arguments or ()), *remote_arguments], port or _WEB_PORT)
         return
     # The logs of a rig elsewhere are elsewhere too.
     log_folder = None if remote else rig_of(rig, overrides).logging.folder_path

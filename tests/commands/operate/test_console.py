@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 import typer
 
+from fitctl.cli import main
 from fitctl.commands.operate import console
 
 
@@ -21,3 +22,12 @@ def test_a_console_that_an_error_ended_has_status_1(monkeypatch, return_code, st
         ended = end.exit_code
 
     assert ended == status
+
+
+def test_a_port_without_a_browser_is_rejected(capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["console", "--port", "9000"])
+
+    assert end.value.code == 2
+    expected = "console: --port 9000 is for --web; add --web, or leave out --port\n"
+    assert capsys.readouterr().err == expected
