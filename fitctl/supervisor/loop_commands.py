@@ -51,7 +51,7 @@ def set_target(rig: Rig, loops: StellarLoops, command: SetTarget) -> str:
             return (
                 f"target {command.az_px:g} {command.el_px:g}: there or on the straight way there the star "
                 f"comes too near that of loop {other.name}, at {az_px:g} {el_px:g}; expected more than "
-                f"{FOLLOWED_PX:g} px between them along one axis"
+                f"{FOLLOWED_PX:g} px between them along one axis; go round it by several targets"
             )
     loop.target_px = target_px
     return ""

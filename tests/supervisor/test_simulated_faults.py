@@ -413,7 +413,7 @@ def test_two_stars_are_not_sent_to_one_place():
 
     assert refused.text == (
         "target 17 15: there or on the straight way there the star comes too near that of loop left, at 12 20; "
-        "expected more than 6 px between them along one axis"
+        "expected more than 6 px between them along one axis; go round it by several targets"
     )
     assert accepted.accepted
     assert pair.command(SetTarget(loop="right", az_px=right[0], el_px=right[1])).accepted
